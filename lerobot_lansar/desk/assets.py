@@ -1,0 +1,63 @@
+"""Where a desk's bodies come from: a CALVIN checkout's ``data`` folder, or URDFs generated from a scene's numbers."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import builtin
+from .errors import DeskError
+from .scenes import Scene
+
+
+@dataclass(frozen=True)
+class Assets:
+    """URDF files of one scene, ready to load.
+
+    Attributes:
+        kind: ``"built-in"`` or ``"original"``; every results file states it.
+        scale: Global scaling to load the desk and the blocks with.
+    """
+
+    kind: str
+    robot: Path
+    desk: Path
+    plane: Path
+    blocks: dict[str, Path]
+    scale: float
+
+
+@contextmanager
+def open_assets(scene: Scene, folder: str | Path | None) -> Iterator[Assets]:
+    """Assets of ``scene``: those in ``folder``, or built-in ones (written to a temporary folder) when it is None.
+
+    Raises:
+        DeskError: ``folder`` lacks a file that the scene needs.
+    """
+    if folder is not None:
+        yield _original(scene, Path(folder))
+        return
+    with tempfile.TemporaryDirectory(prefix="lansar_desk_") as name:
+        path = Path(name)
+        files = builtin.write(scene, path)
+        yield Assets("built-in", path / "robot.urdf", path / "desk.urdf", path / "plane.urdf", files, 1.0)
+
+
+def _original(scene: Scene, folder: Path) -> Assets:
+    assets = Assets(
+        kind="original",
+        robot=folder / "franka_panda" / "panda_longer_finger.urdf",
+        desk=folder / f"calvin_table_{scene.name}" / "urdf" / f"calvin_table_{scene.name}.urdf",
+        plane=folder / "plane" / "plane.urdf",
+        blocks={c: folder / "blocks" / f"block_{c}_{size}.urdf" for c, size in scene.blocks.items()},
+        scale=0.8,
+    )
+    for file in (assets.robot, assets.desk, assets.plane, *assets.blocks.values()):
+        if not file.is_file():
+            raise DeskError(
+                f"asset file {file} is missing; assets must name the `data` folder of a calvin_env checkout "
+                f"(it holds franka_panda/, blocks/, plane/ and calvin_table_{scene.name}/), or be left out for "
+                "the built-in desk"
+            )
+    return assets

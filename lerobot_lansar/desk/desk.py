@@ -1,0 +1,249 @@
+"""The CALVIN desk: a Panda in front of a piece of furniture, simulated by PyBullet."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pybullet as p
+
+from .assets import Assets, open_assets
+from .cameras import CAMERAS, gripper_view, static_view, take_picture
+from .errors import DeskError, SimulationError
+from .furniture import Table, load_blocks
+from .oracle import BlockState, Snapshot, completed_tasks
+from .robot import Robot
+from .scenes import COLORS, Scene, get_scene
+
+CONTROL_HZ = 30
+SUBSTEPS = 8
+"""Simulation steps of 1/240 s per control step of 1/30 s."""
+
+Observation = dict[str, np.ndarray]
+
+_PARKING = 100.0  # where blocks wait while contact caches are cleared (m)
+
+
+class Desk:
+    """One simulated desk in a Bullet client of its own.
+
+    ``robot_obs`` (15,) float64 is CALVIN's: TCP xyz (m), TCP euler xyz (rad), gripper opening width (m), seven arm
+    joints (rad), last gripper action (-1 close, +1 open). ``scene_obs`` (24,) float64: slide, drawer, button, switch
+    joints (m), light bulb, LED (0/1), then xyz (m) and euler xyz (rad) of the red, the blue and the pink block: this
+    order in every scene, whereas CALVIN's own files follow each scene's configuration.
+
+    Args:
+        scene: ``"A"``, ``"B"``, ``"C"`` or ``"D"``.
+        assets: None for the built-in desk, or the ``data`` folder of a calvin_env checkout for the original files.
+        cameras: Pictures that observations hold: any of ``"static"`` (200x200) and ``"gripper"`` (84x84).
+
+    Raises:
+        DeskError: Unknown scene or camera, missing asset files.
+    """
+
+    def __init__(
+        self,
+        scene: str = "D",
+        assets: str | Path | None = None,
+        cameras: Sequence[str] = ("static", "gripper"),
+    ):
+        for camera in cameras:
+            if camera not in CAMERAS:
+                raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+        self.scene: Scene = get_scene(scene)
+        self.cameras = tuple(cameras)
+        self._client = -1
+        with open_assets(self.scene, assets) as files:
+            self.assets = files.kind
+            self._client = p.connect(p.DIRECT)
+            try:
+                self._load(files)
+            except BaseException:
+                self.close()
+                raise
+        self.reset()
+
+    def _load(self, files: Assets) -> None:
+        client = self._client
+        p.setGravity(0, 0, -9.8, physicsClientId=client)
+        self._robot = Robot(client, files)
+        self._blocks = load_blocks(client, files, self.scene)
+        self._table = Table(client, files)
+        plane = p.loadURDF(str(files.plane), physicsClientId=client)
+        # Only after loading: earlier it is lost and the motion depends on how the bodies came in.
+        p.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
+        self._names = {self._robot.body: "robot", self._table.body: "desk", plane: "plane"}
+        self._names |= {block.body: color for color, block in self._blocks.items()}
+        self._desk_links = {index: name for name, index in self._table.links.items()}
+
+    # ---- what users call
+
+    def reset(
+        self,
+        robot_obs: Sequence[float] | np.ndarray | None = None,
+        scene_obs: Sequence[float] | np.ndarray | None = None,
+        seed: int | None = 0,
+    ) -> Observation:
+        """Puts the desk into a state; nothing of what happened before remains.
+
+        Args:
+            robot_obs: (15,) joints, opening width and gripper action are used; None: CALVIN's home pose, hand open.
+            scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks placed at
+                random by ``seed`` as CALVIN does.
+            seed: Decides the blocks' places when ``scene_obs`` is None.
+
+        Returns:
+            The observation after one simulation step, as in CALVIN.
+
+        Raises:
+            DeskError: A state of the wrong length or with a value that is not finite.
+        """
+        self._require_open()
+        robot_state = None if robot_obs is None else _vector(robot_obs, 15, "robot_obs")
+        scene_state = self._random_scene(seed) if scene_obs is None else _vector(scene_obs, 24, "scene_obs")
+        self._clear_contacts()
+        self._put(robot_state, scene_state)
+        return self.observe()
+
+    def step(self, action: Sequence[float] | np.ndarray, control_mode: str = "rel") -> Observation:
+        """Executes one action for 1/30 s.
+
+        Args:
+            action: (7,). ``"rel"``: TCP translation in units of 0.02 m, rotation (euler) in units of 0.05 rad, both
+                added to a target pose that is kept from step to step. ``"abs"``: TCP xyz (m) and euler xyz (rad).
+                Last number in both: the gripper opens if it is positive, closes otherwise.
+            control_mode: ``"rel"`` or ``"abs"``.
+
+        Raises:
+            DeskError: Unknown mode; an action of the wrong shape or with a value that is not finite.
+            SimulationError: The physics diverged; reset before going on.
+        """
+        self._require_open()
+        if control_mode not in ("rel", "abs"):
+            raise DeskError(f"control_mode {control_mode!r} is unknown; it is 'rel' or 'abs'")
+        self._robot.command(_vector(action, 7, "action"), relative=control_mode == "rel")
+        for _ in range(SUBSTEPS):
+            p.stepSimulation(physicsClientId=self._client)
+        self._table.update_lights()
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """``robot_obs``, ``scene_obs`` and a picture ``rgb_<camera>`` (uint8) per camera."""
+        obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
+        if not all(np.isfinite(state).all() for state in obs.values()):
+            raise SimulationError("the simulation diverged: a state is no longer finite; reset the desk to go on")
+        for camera in self.cameras:
+            obs[f"rgb_{camera}"] = self.render(camera)
+        return obs
+
+    def render(self, camera: str = "static", size: int | None = None) -> np.ndarray:
+        """A picture of the present state, (size, size, 3) uint8; ``size`` in pixels, the camera's own by default."""
+        self._require_open()
+        self._table.show_lights()
+        view = static_view() if camera == "static" else gripper_view(*self._robot.camera_pose())
+        return take_picture(self._client, CAMERAS[camera], view, size)
+
+    def snapshot(self) -> Snapshot:
+        """What the task oracle needs of the present state."""
+        self._require_open()
+        touched = p.getContactPoints(bodyA=self._robot.body, physicsClientId=self._client) or ()
+        return Snapshot(
+            slide=self._table.joint("slide"),
+            drawer=self._table.joint("drawer"),
+            bulb=self._table.bulb,
+            led=self._table.led,
+            blocks={color: self._block_state(color) for color in COLORS},
+            touched_by_robot=frozenset(self._names[contact[2]] for contact in touched),
+        )
+
+    def completed_tasks(self, start: Snapshot) -> set[str]:
+        """Names of CALVIN's tasks that are fulfilled between ``start`` and now."""
+        return completed_tasks(start, self.snapshot())
+
+    def solve_ik(self, position: Any, euler: Any, rounds: int = 40) -> np.ndarray:
+        """Arm joints (7,) rad that bring the TCP to a pose, found by repeating Bullet's IK; moves the arm there.
+
+        Meant for choosing a start state between episodes: it leaves the arm displaced, so reset the desk afterwards.
+        """
+        for _ in range(rounds):
+            joints = self._robot.joints_for(np.asarray(position), np.asarray(euler))
+            for joint, value in enumerate(joints):
+                p.resetJointState(self._robot.body, joint, value, physicsClientId=self._client)
+        return joints
+
+    def close(self) -> None:
+        """Disconnects the Bullet client; calling it again does nothing."""
+        if self._client >= 0:
+            p.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    def __enter__(self) -> "Desk":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ---- inside
+
+    def _require_open(self) -> None:
+        if self._client < 0:
+            raise DeskError("this desk is closed; make a new one")
+
+    def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
+        self._table.reset(scene_state[:6])
+        for index, color in enumerate(COLORS):
+            pose = scene_state[6 + 6 * index : 12 + 6 * index]
+            self._blocks[color].place(pose[:3], pose[3:])
+        self._robot.reset(robot_state)
+        p.stepSimulation(physicsClientId=self._client)
+
+    def _clear_contacts(self) -> None:
+        """Bullet keeps contacts over a reset; a step with everything apart makes it forget them."""
+        self._robot.reset(None)
+        self._table.reset(np.zeros(6))
+        for index, block in enumerate(self._blocks.values()):
+            block.place((_PARKING + index, 0, _PARKING), (0, 0, 0))
+        p.stepSimulation(physicsClientId=self._client)
+
+    def _scene_obs(self) -> np.ndarray:
+        return np.concatenate([self._table.observe(), *(self._blocks[c].observe() for c in COLORS)])
+
+    def _block_state(self, color: str) -> BlockState:
+        block = self._blocks[color]
+        contacts = p.getContactPoints(bodyA=block.body, physicsClientId=self._client) or ()
+        position, orientation = block.pose()
+        linear, angular = block.velocity()
+        return BlockState(
+            position=np.array(position),
+            orientation=np.array(orientation),
+            linear_velocity=np.array(linear),
+            angular_velocity=np.array(angular),
+            contacts=frozenset(self._touch(contact[2], contact[4]) for contact in contacts),
+        )
+
+    def _touch(self, body: int, link: int) -> tuple[str, str]:
+        name = self._names[body]
+        return name, self._desk_links[link] if name == "desk" else ""
+
+    def _random_scene(self, seed: int | None) -> np.ndarray:
+        """Everything closed and off; each block on a surface chosen at random, no two of them touching."""
+        rng = np.random.default_rng(seed)
+        areas = list(self.scene.areas.values())
+        while True:
+            poses = []
+            for _ in COLORS:
+                area = areas[rng.integers(len(areas))]
+                poses.append([rng.uniform(*area.x), rng.uniform(*area.y), 0.46, 0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+            # the longest block's half diagonal is 0.045 m
+            if all(np.hypot(a[0] - b[0], a[1] - b[1]) > 0.09 for a, b in itertools.combinations(poses, 2)):
+                return np.array([0.0] * 6 + [x for pose in poses for x in pose])
+
+
+def _vector(values: Any, length: int, name: str) -> np.ndarray:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != (length,):
+        raise DeskError(f"{name} must have shape ({length},), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise DeskError(f"{name} must be finite, got {array.tolist()}")
+    return array

@@ -1,0 +1,120 @@
+"""What stands around the arm: the desk with its joints and lights, and the three blocks."""
+
+from typing import Any
+
+import numpy as np
+import pybullet as p
+
+from .assets import Assets
+from .scenes import BUTTON_TRAVEL, SWITCH_TRAVEL, Scene
+
+OFF = (1.0, 1.0, 1.0, 1.0)
+LED_ON = (0.0, 1.0, 0.0, 1.0)
+BULB_ON = (1.0, 1.0, 0.0, 1.0)
+JOINT_FORCE = 4.0
+
+
+class Table:
+    """The desk: slide, drawer, button and switch joints, light bulb and LED.
+
+    Attributes:
+        body: Bullet body id.
+        links: Link name to link index (``base_link`` is -1).
+        bulb, led: Whether each light is on.
+    """
+
+    def __init__(self, client: int, assets: Assets):
+        self.client = client
+        self.body = p.loadURDF(str(assets.desk), globalScaling=assets.scale, physicsClientId=client)
+        self.links = {"base_link": -1}
+        self._joints: dict[str, int] = {}
+        for index in range(p.getNumJoints(self.body, physicsClientId=client)):
+            info = p.getJointInfo(self.body, index, physicsClientId=client)
+            self.links[info[12].decode()] = index
+            self._joints[info[1].decode().removeprefix("base__")] = index
+        for name in ("slide", "drawer", "switch"):
+            p.setJointMotorControl2(
+                self.body, self._joints[name], p.VELOCITY_CONTROL, force=JOINT_FORCE, physicsClientId=client
+            )
+        p.setJointMotorControl2(
+            self.body,
+            self._joints["button"],
+            p.POSITION_CONTROL,
+            targetPosition=0,
+            force=JOINT_FORCE,
+            physicsClientId=client,
+        )
+        self.bulb = self.led = False
+        self._shown = {"led": False, "bulb": False}
+        self._was_pressed = self._was_on = False
+
+    def joint(self, name: str) -> float:
+        """Position (m) of ``slide``, ``drawer``, ``button`` or ``switch``."""
+        return p.getJointState(self.body, self._joints[name], physicsClientId=self.client)[0]
+
+    def reset(self, state: np.ndarray) -> None:
+        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the head of ``scene_obs``."""
+        for name, value in zip(("slide", "drawer", "button", "switch"), state[:4], strict=True):
+            p.resetJointState(self.body, self._joints[name], value, physicsClientId=self.client)
+        self.bulb, self.led = bool(state[4] > 0.5), bool(state[5] > 0.5)
+        self._was_pressed = self._was_on = False
+
+    def update_lights(self) -> None:
+        """Called once per control step: a new press toggles the LED, a moved switch sets the bulb."""
+        pressed = self.joint("button") > BUTTON_TRAVEL / 2
+        if pressed and not self._was_pressed:
+            self.led = not self.led
+        self._was_pressed = pressed
+        on = self.joint("switch") > SWITCH_TRAVEL / 2
+        if on != self._was_on:
+            self.bulb = on
+        self._was_on = on
+
+    def show_lights(self) -> None:
+        """Paints the lights in their present state; needed before a picture only."""
+        for name, link, lit, color in (
+            ("led", "led_link", self.led, LED_ON),
+            ("bulb", "light_link", self.bulb, BULB_ON),
+        ):
+            if lit != self._shown[name]:
+                rgba = color if lit else OFF
+                p.changeVisualShape(self.body, self.links[link], rgbaColor=rgba, physicsClientId=self.client)
+                self._shown[name] = lit
+
+    def observe(self) -> np.ndarray:
+        """The first six numbers of ``scene_obs``: (6,) float64."""
+        joints = [self.joint(name) for name in ("slide", "drawer", "button", "switch")]
+        return np.array([*joints, float(self.bulb), float(self.led)])
+
+
+class Block:
+    """One of the three blocks."""
+
+    def __init__(self, client: int, assets: Assets, color: str):
+        self.client = client
+        self.color = color
+        self.body = p.loadURDF(str(assets.blocks[color]), globalScaling=assets.scale, physicsClientId=client)
+
+    def place(self, position: Any, euler: Any) -> None:
+        """Puts the block at ``position`` (3,) m with ``euler`` (3,) rad, at rest."""
+        p.resetBasePositionAndOrientation(
+            self.body, position, p.getQuaternionFromEuler(euler), physicsClientId=self.client
+        )
+
+    def pose(self) -> tuple[Any, Any]:
+        """Position (3,) m and quaternion xyzw (4,)."""
+        return p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
+
+    def velocity(self) -> tuple[Any, Any]:
+        """Linear (m/s) and angular (rad/s) velocity, (3,) each."""
+        return p.getBaseVelocity(self.body, physicsClientId=self.client)
+
+    def observe(self) -> np.ndarray:
+        """Position (m) and euler angles (rad): (6,) float64."""
+        position, orientation = self.pose()
+        return np.array([*position, *p.getEulerFromQuaternion(orientation)])
+
+
+def load_blocks(client: int, assets: Assets, scene: Scene) -> dict[str, Block]:
+    """Loads the blocks in the scene's original order, which fixes Bullet's body ids."""
+    return {color: Block(client, assets, color) for color in scene.blocks}

@@ -1,0 +1,143 @@
+"""The Panda arm: loading, CALVIN's inverse kinematics and position control, and the 15 numbers of ``robot_obs``."""
+
+from typing import Any
+
+import numpy as np
+import pybullet as p
+
+from .assets import Assets
+
+BASE_POSITION = (-0.34, -0.46, 0.24)
+HOME_JOINTS = (-1.21779206, 1.03987646, 2.11978261, -2.34205014, -0.87015947, 1.64119353, 0.55344866)
+ARM = tuple(range(7))
+FINGERS = (9, 11)
+FINGER_OPEN = 0.04
+TCP_LINK = 15
+CAMERA_LINK = 14
+ARM_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+ARM_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+POSITION_STEP = 0.02
+"""Metres that one unit of a relative action moves the target."""
+ANGLE_STEP = 0.05
+"""Radians that one unit of a relative action turns the target."""
+
+_IK = {
+    "lowerLimits": [-7.0] * 9,
+    "upperLimits": [7.0] * 9,
+    "jointRanges": [7.0] * 9,
+    "restPoses": [*HOME_JOINTS, FINGER_OPEN, FINGER_OPEN],
+}
+
+
+class Robot:
+    """The arm in one Bullet client.
+
+    Attributes:
+        body: Bullet body id.
+        gripper_action: The last gripper command, -1 (close) or +1 (open).
+    """
+
+    def __init__(self, client: int, assets: Assets):
+        self.client = client
+        self.body = p.loadURDF(
+            str(assets.robot), BASE_POSITION, (0, 0, 0, 1), useFixedBase=True, physicsClientId=client
+        )
+        gear = p.createConstraint(
+            self.body,
+            FINGERS[0],
+            self.body,
+            FINGERS[1],
+            jointType=p.JOINT_GEAR,
+            jointAxis=[1, 0, 0],
+            parentFramePosition=[0, 0, 0],
+            childFramePosition=[0, 0, 0],
+            physicsClientId=client,
+        )
+        p.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=client)
+        height = BASE_POSITION[2]
+        pedestal = p.createVisualShape(
+            p.GEOM_CYLINDER, radius=0.13, length=height, rgbaColor=(1, 1, 1, 1), physicsClientId=client
+        )
+        p.createMultiBody(
+            baseVisualShapeIndex=pedestal,
+            basePosition=(BASE_POSITION[0], BASE_POSITION[1], height / 2),
+            physicsClientId=client,
+        )
+        self.gripper_action = 1.0
+        self._target_position = np.zeros(3)
+        self._target_euler = np.zeros(3)
+
+    def reset(self, robot_obs: np.ndarray | None) -> None:
+        """Sets the arm's joints and half the opening width for each finger; the TCP part of ``robot_obs`` is ignored.
+
+        The relative mode's target becomes the TCP pose reached here.
+        """
+        joints = HOME_JOINTS if robot_obs is None else robot_obs[7:14]
+        finger = FINGER_OPEN if robot_obs is None else robot_obs[6] / 2
+        self.gripper_action = 1.0 if robot_obs is None or robot_obs[14] > 0 else -1.0
+        for joint, value in zip(ARM, joints, strict=True):
+            p.resetJointState(self.body, joint, value, physicsClientId=self.client)
+            self._drive(joint, value, force=200, max_velocity=2)
+        for joint in FINGERS:
+            p.resetJointState(self.body, joint, finger, physicsClientId=self.client)
+            self._drive(joint, finger, force=200, max_velocity=1)
+        position, orientation = self.tcp_pose()
+        self._target_position = np.array(position)
+        self._target_euler = np.array(p.getEulerFromQuaternion(orientation))
+
+    def command(self, action: np.ndarray, relative: bool) -> None:
+        """Sets the motors' targets from a (7,) action; the simulation is stepped by the desk.
+
+        In relative mode the action moves a target that is kept from step to step and never re-anchored to the arm.
+        """
+        if relative:
+            self._target_position += action[:3] * POSITION_STEP
+            self._target_euler += action[3:6] * ANGLE_STEP
+            position, euler = self._target_position, self._target_euler
+        else:
+            position, euler = action[:3], action[3:6]
+        self.gripper_action = 1.0 if action[6] > 0 else -1.0
+        for joint, value in zip(ARM, self.joints_for(position, euler), strict=True):
+            self._drive(joint, value, force=200, max_velocity=2)
+        opening = self.gripper_action > 0
+        for joint in FINGERS:
+            self._drive(joint, FINGER_OPEN if opening else 0.0, force=2 if opening else 200, max_velocity=1)
+
+    def joints_for(self, position: np.ndarray, euler: np.ndarray) -> np.ndarray:
+        """One call of Bullet's null-space IK from the current joints, clipped to the real limits: (7,) rad."""
+        solution = p.calculateInverseKinematics(
+            self.body,
+            TCP_LINK,
+            position,
+            p.getQuaternionFromEuler(euler),
+            physicsClientId=self.client,
+            **_IK,
+        )
+        return np.clip(solution[:7], ARM_LOWER, ARM_UPPER)
+
+    def _drive(self, joint: int, target: float, force: float, max_velocity: float) -> None:
+        p.setJointMotorControl2(
+            bodyIndex=self.body,
+            jointIndex=joint,
+            controlMode=p.POSITION_CONTROL,
+            force=force,
+            targetPosition=target,
+            maxVelocity=max_velocity,
+            physicsClientId=self.client,
+        )
+
+    def tcp_pose(self) -> tuple[Any, Any]:
+        """TCP position (3,) m and quaternion xyzw (4,), one simulation step old during motion, as CALVIN reads it."""
+        return p.getLinkState(self.body, TCP_LINK, physicsClientId=self.client)[:2]
+
+    def camera_pose(self) -> tuple[Any, Any]:
+        """Pose of the gripper camera's link, as old as :meth:`tcp_pose`."""
+        return p.getLinkState(self.body, CAMERA_LINK, physicsClientId=self.client)[:2]
+
+    def observe(self) -> np.ndarray:
+        """``robot_obs``: TCP xyz, TCP euler, opening width, seven arm joints, last gripper action; (15,) float64."""
+        position, orientation = self.tcp_pose()
+        fingers = [p.getJointState(self.body, j, physicsClientId=self.client)[0] for j in FINGERS]
+        arm = [p.getJointState(self.body, j, physicsClientId=self.client)[0] for j in ARM]
+        euler = p.getEulerFromQuaternion(orientation)
+        return np.array([*position, *euler, fingers[0] + fingers[1], *arm, self.gripper_action])

@@ -1,0 +1,151 @@
+"""The four CALVIN scenes as data: where each fixed object sits, which blocks lie about and where they start.
+
+Everything is in metres in the world frame, after CALVIN's global scaling of 0.8. The four desks are the same piece
+of furniture with its parts in different places, so a scene is a handful of numbers.
+"""
+
+from dataclasses import dataclass
+
+from .errors import DeskError
+
+COLORS = ("red", "blue", "pink")
+"""The order in which this package writes blocks into ``scene_obs``, whatever the scene."""
+
+BLOCK_LENGTHS = {"small": 0.04, "middle": 0.056, "big": 0.08}
+"""A block's extent along its own x axis (m); its other two sides are 0.04 m."""
+
+BLOCK_SIDE = 0.04
+
+
+@dataclass(frozen=True)
+class Area:
+    """A horizontal rectangle in which block centres start (m), at a height of 0.46."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One of CALVIN's desks.
+
+    Attributes:
+        name: The letter by which users call it.
+        blocks: Colour to block variant (small, middle, big), in the scene's ORIGINAL order: the order in which
+            CALVIN loads the blocks and writes them into its files (A and C differ from red, blue, pink).
+        areas: Where blocks start, by CALVIN's names.
+        button_x, switch_x, light_x, led_x, slide_x, drawer_x: World x of each part at joint value 0.
+        cabinet: World x range of the open cabinet, whose floor is the plank.
+        slide_travel: Upper limit of the sliding door (m).
+        wood, dark_wood, metal: Colours (rgb in [0, 1]) of the built-in desk.
+    """
+
+    name: str
+    blocks: dict[str, str]
+    areas: dict[str, Area]
+    button_x: float
+    switch_x: float
+    light_x: float
+    led_x: float
+    slide_x: float
+    drawer_x: float
+    cabinet: tuple[float, float]
+    slide_travel: float
+    wood: tuple[float, float, float]
+    dark_wood: tuple[float, float, float]
+    metal: tuple[float, float, float]
+
+
+DRAWER_TRAVEL = 0.22
+SWITCH_TRAVEL = 0.088
+BUTTON_TRAVEL = 0.02
+
+_BEHIND = (0.05, 0.12)
+_FRONT = (-0.15, -0.03)
+
+
+def _areas(table: tuple[float, float], left: tuple[float, float], right: tuple[float, float]) -> dict[str, Area]:
+    return {
+        "table": Area(table, _FRONT),
+        "slider_left": Area(left, _BEHIND),
+        "slider_right": Area(right, _BEHIND),
+    }
+
+
+SCENES = {
+    "A": Scene(
+        name="A",
+        blocks={"pink": "small", "blue": "big", "red": "middle"},
+        areas=_areas((-0.20, 0.35), (-0.32, -0.16), (-0.05, 0.13)),
+        button_x=-0.28,
+        switch_x=0.30,
+        light_x=0.30,
+        led_x=-0.28,
+        slide_x=-0.10,
+        drawer_x=0.10,
+        cabinet=(-0.36, 0.16),
+        slide_travel=0.28,
+        wood=(0.46, 0.27, 0.19),
+        dark_wood=(0.36, 0.20, 0.14),
+        metal=(0.36, 0.37, 0.40),
+    ),
+    "B": Scene(
+        name="B",
+        blocks={"red": "small", "blue": "big", "pink": "middle"},
+        areas=_areas((-0.35, 0.15), (-0.12, 0.06), (0.15, 0.33)),
+        button_x=0.28,
+        switch_x=-0.32,
+        light_x=-0.32,
+        led_x=0.28,
+        slide_x=0.088,
+        drawer_x=0.18,
+        cabinet=(-0.18, 0.34),
+        slide_travel=0.304,
+        wood=(0.87, 0.78, 0.62),
+        dark_wood=(0.78, 0.67, 0.50),
+        metal=(0.45, 0.46, 0.48),
+    ),
+    "C": Scene(
+        name="C",
+        blocks={"blue": "small", "red": "big", "pink": "middle"},
+        areas=_areas((0.00, 0.35), (-0.12, 0.06), (0.15, 0.30)),
+        button_x=-0.12,
+        switch_x=-0.32,
+        light_x=-0.32,
+        led_x=-0.12,
+        slide_x=0.06,
+        drawer_x=0.10,
+        cabinet=(-0.18, 0.34),
+        slide_travel=0.24,
+        wood=(0.66, 0.50, 0.27),
+        dark_wood=(0.49, 0.37, 0.21),
+        metal=(0.25, 0.26, 0.28),
+    ),
+    "D": Scene(
+        name="D",
+        blocks={"red": "middle", "blue": "small", "pink": "big"},
+        areas=_areas((0.00, 0.35), (-0.32, -0.16), (-0.05, 0.13)),
+        button_x=-0.12,
+        switch_x=0.30,
+        light_x=0.30,
+        led_x=-0.12,
+        slide_x=-0.10,
+        drawer_x=0.18,
+        cabinet=(-0.36, 0.16),
+        slide_travel=0.28,
+        wood=(0.62, 0.44, 0.27),
+        dark_wood=(0.50, 0.33, 0.19),
+        metal=(0.33, 0.34, 0.36),
+    ),
+}
+
+
+def get_scene(name: str) -> Scene:
+    """The scene called ``name``.
+
+    Raises:
+        DeskError: There is no such scene.
+    """
+    if name not in SCENES:
+        raise DeskError(f"scene {name!r} is unknown; choose one of {', '.join(SCENES)}")
+    return SCENES[name]
