@@ -1,0 +1,194 @@
+"""Start states in which a given task can be carried out, drawn at random: for single-task episodes and demonstrations."""
+
+import itertools
+
+import numpy as np
+
+from .desk import Desk
+from .errors import DeskError
+from .oracle import DRAWER, PLANK, TABLE, TASKS
+from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, COLORS, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
+
+TABLE_Z = 0.46
+"""Height of a block's centre on the table and on the cabinet's floor (m)."""
+DRAWER_Z = 0.362
+"""Height of a block's centre in the drawer (m)."""
+
+_CLEARANCE = 0.10  # between block centres (m): no two blocks touch, and a hand fits between most of them
+_TRIES = 200
+_REACHED = 0.02  # a start pose counts when IK brings the TCP this near (m)
+
+
+def sample_start(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A random state of ``desk`` in which ``task`` is feasible, and not yet fulfilled.
+
+    Joints and lights that the task does not care about are random, blocks lie in the scene's areas with yaw in
+    pi/2 +- pi/8 (both as in CALVIN's benchmark), the TCP is anywhere in a box above the table. For ``place_*`` and
+    ``stack_block`` a block is in the hand, for ``unstack_block`` one stands on another.
+
+    Args:
+        desk: Used to solve inverse kinematics and to settle the blocks; left in the returned state.
+        task: One of :data:`TASKS`.
+        rng: Decides everything.
+
+    Returns:
+        ``robot_obs`` (15,) and ``scene_obs`` (24,), arguments for :meth:`Desk.reset`.
+
+    Raises:
+        DeskError: Unknown task, or no feasible state found.
+    """
+    if task not in TASKS:
+        raise DeskError(f"task {task!r} is unknown; choose one of: {', '.join(TASKS)}")
+    cameras, desk.cameras = desk.cameras, ()
+    try:
+        for _ in range(_TRIES):
+            start = _try(desk, task, rng)
+            if start is not None:
+                return start
+    finally:
+        desk.cameras = cameras
+    raise DeskError(f"found no start state for task {task!r} in scene {desk.scene.name} in {_TRIES} tries")
+
+
+def _try(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+    state = _furniture(desk.scene, task, rng)
+    held = _held_color(task, rng)
+    poses = _blocks(desk.scene, task, held, state, rng)
+    if poses is None:
+        return None
+    robot = _arm(desk, held is not None, rng)
+    if robot is None:
+        return None
+    if held is not None:
+        # between the fingers, long side across them
+        poses[held] = np.array([*robot[:3], 0.0, 0.0, robot[5]])
+    scene = np.concatenate([state, *(poses[color] for color in COLORS)])
+    obs = desk.reset(robot, scene)
+    for _ in range(4):
+        obs = desk.step([*robot[:6], robot[14]], control_mode="abs")
+    robot_obs, scene_obs = obs["robot_obs"].copy(), obs["scene_obs"].copy()
+    if not _is_feasible(desk, task, held, scene, scene_obs):
+        return None
+    desk.reset(robot_obs, scene_obs)
+    return robot_obs, scene_obs
+
+
+def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, got: np.ndarray) -> bool:
+    """Whether the state after settling still is what was asked for."""
+    snapshot = desk.snapshot()
+    if snapshot.touched_by_robot != (frozenset() if held is None else {held}):
+        return False
+    if held is not None and snapshot.blocks[held].bodies != {"robot"}:
+        return False
+    blocks = slice(6, None)
+    positions = [np.r_[0:3] + 6 * i for i in range(3)]
+    if any(np.linalg.norm(got[blocks][i] - wanted[blocks][i]) > 0.02 for i in positions):
+        return False
+    color = _color(task)
+    if color is not None:
+        surface = {"slider": PLANK, "drawer": DRAWER}.get(task.rsplit("_", 1)[-1], TABLE)
+        return snapshot.blocks[color].contacts == {surface}
+    if task == "unstack_block":
+        return any(b.bodies and b.bodies <= set(COLORS) and b.resting for b in snapshot.blocks.values())
+    return bool(np.allclose(got[[0, 1, 3, 4, 5]], wanted[[0, 1, 3, 4, 5]], atol=5e-3))
+
+
+def _color(task: str) -> str | None:
+    """The block that a task names, if it names one."""
+    words = task.split("_")
+    return words[1] if len(words) > 2 and words[1] in COLORS else None
+
+
+def _held_color(task: str, rng: np.random.Generator) -> str | None:
+    if task in ("place_in_slider", "place_in_drawer", "stack_block"):
+        return COLORS[rng.integers(3)]
+    return None
+
+
+def _furniture(scene: Scene, task: str, rng: np.random.Generator) -> np.ndarray:
+    """Slide, drawer, button, switch, bulb, LED: (6,); joints are at an end three times out of four."""
+    bulb, led = (bool(rng.integers(2)) for _ in range(2))
+    bulb = {"turn_on_lightbulb": False, "turn_off_lightbulb": True}.get(task, bulb)
+    led = {"turn_on_led": False, "turn_off_led": True}.get(task, led)
+    slide = _joint(rng, scene.slide_travel, 0.17, {"move_slider_left": 0, "move_slider_right": 1}.get(task))
+    needed = {"open_drawer": 0, "close_drawer": 1}.get(task)
+    drawer = _joint(rng, DRAWER_TRAVEL, 0.14, needed)
+    if task.endswith("_drawer") and needed is None or task == "push_into_drawer":
+        drawer = DRAWER_TRAVEL
+    if task.startswith("lift_") and task.endswith("_slider") or task == "place_in_slider":
+        slide = scene.slide_travel * rng.integers(2)
+    return np.array([slide, drawer, 0.0, SWITCH_TRAVEL * bulb, float(bulb), float(led)])
+
+
+def _joint(rng: np.random.Generator, travel: float, needed: float, end: int | None) -> float:
+    """A joint value; ``end`` 0 or 1 leaves at least ``needed`` (m) to the other end."""
+    end = int(rng.integers(2)) if end is None else end
+    slack = (travel - needed) * rng.uniform() if rng.uniform() < 0.25 else 0.0
+    return slack if end == 0 else travel - slack
+
+
+def _blocks(
+    scene: Scene, task: str, held: str | None, state: np.ndarray, rng: np.random.Generator
+) -> dict[str, np.ndarray] | None:
+    """Block poses (6,) by colour, or None when they came too near to each other."""
+    color = _color(task)
+    open_side = "slider_right" if state[0] > scene.slide_travel / 2 else "slider_left"
+    places = {c: str(rng.choice(list(scene.areas))) for c in COLORS}
+    if color is not None:
+        last = task.rsplit("_", 1)[-1]
+        places[color] = {"slider": open_side, "drawer": "drawer"}.get(last, "table")
+    if task == "push_into_drawer":
+        pushed = COLORS[rng.integers(3)]
+        places = {c: "drawer_edge" if c == pushed else str(rng.choice(list(scene.areas)[1:])) for c in COLORS}
+    if task == "stack_block":
+        places[next(c for c in COLORS if c != held)] = "table"
+    poses = {c: _on(scene, places[c], rng) for c in COLORS if c != held}
+    if task == "unstack_block":
+        top, bottom = rng.permutation(COLORS)[:2]
+        poses[bottom] = _on(scene, "table", rng)
+        poses[top] = poses[bottom] + [0, 0, BLOCK_SIDE, 0, 0, 0]
+        others = [poses[c] for c in COLORS if c != top]
+    else:
+        others = list(poses.values())
+    if any(np.linalg.norm(a[:2] - b[:2]) < _CLEARANCE for a, b in itertools.combinations(others, 2)):
+        return None
+    longest = max(BLOCK_LENGTHS.values()) / 2
+    if any(
+        abs(pose[0] - scene.button_x) < longest + 0.04 and abs(pose[1] + 0.12) < longest + 0.04 for pose in others
+    ):
+        return None  # half on the button's rim
+    return poses
+
+
+def _on(scene: Scene, place: str, rng: np.random.Generator) -> np.ndarray:
+    yaw = np.pi / 2 + rng.uniform(-np.pi / 8, np.pi / 8)
+    if place == "drawer":
+        xyz = [scene.drawer_x + rng.uniform(-0.11, 0.11), rng.uniform(-0.32, -0.25), DRAWER_Z]
+    elif place == "drawer_edge":
+        xyz = [scene.drawer_x + rng.uniform(-0.10, 0.10), rng.uniform(-0.12, -0.06), TABLE_Z]
+    else:
+        area = scene.areas[place]
+        xyz = [rng.uniform(*area.x), rng.uniform(*area.y), TABLE_Z]
+    return np.array([*xyz, 0.0, 0.0, yaw])
+
+
+def _arm(desk: Desk, holding: bool, rng: np.random.Generator) -> np.ndarray | None:
+    """``robot_obs`` (15,) of a random pose above the table, gripper down, or None when the arm cannot reach it."""
+    position = np.array([rng.uniform(-0.25, 0.30), rng.uniform(-0.32, -0.08), rng.uniform(0.53, 0.66)])
+    euler = np.array([np.pi + rng.normal(0, 0.05), rng.normal(0, 0.05), np.pi / 2 + rng.uniform(-0.4, 0.4)])
+    if holding:
+        euler[:2] = np.pi, 0.0
+    desk.reset(None, _away())
+    joints = desk.solve_ik(position, euler)
+    opened = bool(rng.uniform() < 0.7) and not holding
+    width = 0.039 if holding else 0.08 if opened else 0.0
+    robot = np.array([*position, *euler, width, *joints, 1.0 if opened else -1.0])
+    reached = desk.reset(robot, _away())["robot_obs"]
+    if np.linalg.norm(reached[:3] - position) > _REACHED:
+        return None
+    return np.array([*reached[:6], width, *joints, robot[14]])
+
+
+def _away() -> np.ndarray:
+    """A scene whose blocks are out of the arm's reach."""
+    return np.array([0.0] * 6 + [v for i in range(3) for v in (3.0 + i, 3.0, 0.02, 0.0, 0.0, 0.0)])
