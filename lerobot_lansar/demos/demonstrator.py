@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..desk import Desk, DeskError
+from ..desk import TASKS, Desk, DeskError
 from ..desk.robot import ANGLE_STEP, POSITION_STEP
 from ..desk.starts import sample_start
 from .skills import SKILLS, View, Waypoint
@@ -64,7 +64,7 @@ def demonstrate(desk: Desk, task: str, rng: np.random.Generator, noise: float = 
         raise DeskError(f"task {task!r} cannot be demonstrated yet; choose among: {', '.join(SKILLS)}")
     robot_obs, scene_obs = sample_start(desk, task, rng)
     obs = desk.reset(robot_obs, scene_obs)
-    start = desk.snapshot()
+    start, fulfilled = desk.snapshot(), TASKS[task]
     view = View(desk.scene, obs["robot_obs"], obs["scene_obs"], rng)
     speed = rng.uniform(0.8, 1.0)
     disturbance = _Disturbance(noise, rng)
@@ -83,7 +83,7 @@ def demonstrate(desk: Desk, task: str, rng: np.random.Generator, noise: float = 
             obs = desk.step(disturbance.of(action), control_mode="abs")
             view.robot_obs, view.scene_obs = obs["robot_obs"], obs["scene_obs"]
             remaining -= 1
-            if remaining > _AFTERWARDS and task in desk.completed_tasks(start):
+            if remaining > _AFTERWARDS and fulfilled(start, desk.snapshot()):
                 remaining = _AFTERWARDS
             error = float(np.linalg.norm(distance) + 0.1 * np.abs(turn).max())
             stalled = 0 if error < best - 1e-3 else stalled + 1
@@ -92,7 +92,7 @@ def demonstrate(desk: Desk, task: str, rng: np.random.Generator, noise: float = 
                 break
         if remaining <= 0:
             break
-    if task not in desk.completed_tasks(start):
+    if not fulfilled(start, desk.snapshot()):
         return None
     return Demonstration(task, {key: np.stack([row[key] for row in rows]) for key in rows[0]})
 
