@@ -54,13 +54,13 @@ class Robot:
             physicsClientId=client,
         )
         p.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50, physicsClientId=client)
-        height = BASE_POSITION[2]
+        x, y, height = BASE_POSITION
         pedestal = p.createVisualShape(
             p.GEOM_CYLINDER, radius=0.13, length=height, rgbaColor=(1, 1, 1, 1), physicsClientId=client
         )
         p.createMultiBody(
             baseVisualShapeIndex=pedestal,
-            basePosition=(BASE_POSITION[0], BASE_POSITION[1], height / 2),
+            basePosition=(x - 0.05, y, height / 2),
             physicsClientId=client,
         )
         self.gripper_action = 1.0
