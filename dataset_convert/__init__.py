@@ -1,0 +1,1 @@
+"""CALVIN demonstrations as LeRobotDatasets: ``lansar-convert`` or ``python -m dataset_convert``."""

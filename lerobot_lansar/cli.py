@@ -1,0 +1,84 @@
+"""``lerobot``: one command in front of LeRobot's own, with ``key=value`` options.
+
+LeRobot 0.6 installs ``lerobot-train``, ``lerobot-eval``, … but no ``lerobot``. This one only rewrites the
+options and hands over.
+"""
+
+import os
+import sys
+import sysconfig
+from pathlib import Path
+
+HELP = """usage: lerobot COMMAND [key=value ...] [--option=value ...]
+
+Runs LeRobot's own lerobot-COMMAND: key=value becomes --key=value, and what starts with - is passed on.
+
+    lerobot train policy=lansar dataset.repo_id=you/desk_D steps=3000
+    lerobot eval policy=outputs/train/checkpoints/last/pretrained_model env=calvin seed=0
+
+policy=NAME is --policy.type=NAME; policy=FOLDER or policy=user/model is --policy.path=…;
+env=NAME is --env.type=NAME. lerobot COMMAND --help lists a command's options.
+"""
+
+
+def commands() -> dict[str, Path]:
+    """LeRobot's commands installed beside this Python, by the word after ``lerobot-``."""
+    scripts = Path(sysconfig.get_path("scripts"))
+    return {path.stem.removeprefix("lerobot-"): path for path in sorted(scripts.glob("lerobot-*"))}
+
+
+def translate(command: str, arguments: list[str]) -> list[str]:
+    """Turns ``key=value`` into LeRobot's ``--key=value``.
+
+    Args:
+        command: the word after ``lerobot``.
+        arguments: what follows it.
+
+    Returns:
+        The arguments of ``lerobot-<command>``.
+
+    Raises:
+        ValueError: an argument is neither an option nor ``key=value``.
+    """
+    translated = []
+    for position, argument in enumerate(arguments):
+        key, equals, value = argument.partition("=")
+        follows_option = (
+            position > 0 and arguments[position - 1].startswith("--") and "=" not in arguments[position - 1]
+        )
+        if argument.startswith("-") or (follows_option and not equals):
+            translated.append(argument)
+        elif not equals:
+            raise ValueError(
+                f"{argument!r} is neither key=value nor an option; see `lerobot {command} --help`"
+            )
+        elif key == "policy":
+            # A checkpoint is a folder or user/model on the hub; only training makes a policy from its name.
+            is_checkpoint = command == "eval" or "/" in value or Path(value).exists()
+            translated.append(f"--policy.{'path' if is_checkpoint else 'type'}={value}")
+        elif key == "env":
+            translated.append(f"--env.type={value}")
+        else:
+            translated.append(f"--{argument}")
+    return translated
+
+
+def main() -> int:
+    """Replaces this process by LeRobot's command; returns 2 after an error, 0 after help."""
+    if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
+        print(HELP)
+        print("Commands: " + ", ".join(commands()))
+        return 0
+    word, arguments = sys.argv[1], sys.argv[2:]
+    try:
+        if word not in commands():
+            raise ValueError(f"there is no lerobot-{word} here; commands: {', '.join(commands())}")
+        script = str(commands()[word])
+        os.execv(script, [script, *translate(word, arguments)])
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

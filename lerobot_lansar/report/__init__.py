@@ -1,0 +1,1 @@
+"""Tables and plots from what ``lerobot-eval`` wrote; knows neither the desk nor the policy."""

@@ -1,0 +1,145 @@
+"""``lansar-report``: the tables and plots of one evaluation."""
+
+import json
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.utils import DraccusException
+
+from lerobot_lansar.report.results import collect, read_eval_info, read_lines, summarise
+
+
+@dataclass
+class ReportConfig:
+    """Success rates of one evaluation on the CALVIN desk, printed and saved with two plots."""
+
+    # --output_dir of the lerobot-eval run: it holds eval_info.json
+    eval_dir: Path
+    # where to write report.json, report.md and the plots; eval_dir by default
+    output_dir: Path | None = None
+    # --env.results_dir of that run, with episodes-*.jsonl; eval_dir by default
+    results_dir: Path | None = None
+    # --seed of that run; by default the smallest seed in episodes-*.jsonl, or LeRobot's default, 1000
+    seed: int | None = None
+    # --policy.path of that run, to state whether the policy reads the simulator's own state
+    policy_path: Path | None = None
+
+
+def report(config: ReportConfig) -> dict[str, Any]:
+    """Writes ``report.json``, ``report.md``, ``tasks.png`` and, for chains, ``in_a_row.png``.
+
+    Args:
+        config: the command's options.
+
+    Returns:
+        What ``report.json`` holds: the figures of ``summarise``, notes and the package's version.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is malformed, or the files are not of one evaluation.
+    """
+    results_dir = config.results_dir or config.eval_dir
+    if not results_dir.is_dir():
+        raise FileNotFoundError(f"--results_dir={results_dir} is not a folder")
+    entries, lines = read_eval_info(config.eval_dir), read_lines(results_dir)
+    if config.results_dir and not lines:
+        raise FileNotFoundError(f"--results_dir={results_dir} holds no episodes-*.jsonl")
+    summary = summarise(collect(entries, lines, config.seed))
+    summary["policy_reads_scene_state"] = _reads_scene_state(config.policy_path)
+    summary["notes"] = _notes(summary)
+    summary["lerobot_policy_lansar"] = version("lerobot_policy_lansar")
+
+    output_dir = config.output_dir or config.eval_dir
+    output_dir.mkdir(parents=True, exist_ok=True)
+    (output_dir / "report.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (output_dir / "report.md").write_text(as_markdown(summary))
+    from lerobot_lansar.report.plots import plot_in_a_row, plot_tasks
+
+    plot_tasks(summary, output_dir / "tasks.png")
+    if "in_a_row" in summary:
+        plot_in_a_row(summary, output_dir / "in_a_row.png")
+    return summary
+
+
+def _reads_scene_state(policy_path: Path | None) -> bool | None:
+    if policy_path is None:
+        return None
+    path = policy_path / "config.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing: --policy_path must be a pretrained_model folder")
+    policy = json.loads(path.read_text())
+    # LanSAR can leave the scene out of its network although the data have it.
+    is_used = policy.get("use_spatial_context", True)
+    return is_used and "observation.environment_state" in (policy.get("input_features") or {})
+
+
+def _notes(summary: dict[str, Any]) -> list[str]:
+    notes = []
+    assets = summary["settings"]["assets"]
+    if assets != "original":
+        desk = "the built-in desk" if assets == "built-in" else "a desk that the files do not name"
+        notes.append(f"Measured on {desk}: not comparable with published CALVIN numbers.")
+    if summary["policy_reads_scene_state"]:
+        notes.append(
+            "The policy reads the simulator's own scene state (privileged), which a real robot has not."
+        )
+    elif summary["policy_reads_scene_state"] is None:
+        notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
+    if "in_a_row" in summary and summary["episodes"] < 1000:
+        notes.append(f"{summary['episodes']} of the benchmark's 1000 chains.")
+    return notes
+
+
+def as_markdown(summary: dict[str, Any]) -> str:
+    """The report as text.
+
+    Args:
+        summary: what :func:`report` returns.
+    """
+    known = {key: value for key, value in summary["settings"].items() if value is not None}
+    first, last = summary["seeds"]
+    facts = [f"{summary['episodes']} episodes", f"seeds {first} to {last}"]
+    facts += [f"{key.replace('_', ' ')} {value}" for key, value in known.items()]
+    lines = ["# Evaluation on the CALVIN desk", "", "; ".join(facts) + ".", ""]
+    lines += [f"* {note}" for note in summary["notes"]]
+    if "in_a_row" in summary:
+        shares = " | ".join(f"{100 * share:.1f} %" for share in summary["in_a_row"])
+        lines += ["", "| in a row | 1 | 2 | 3 | 4 | 5 | average length |", "| --- " * 7 + "|"]
+        lines += [f"| chains | {shares} | {summary['average_length']:.3f} |"]
+    width = max(len(task) for task in summary["tasks"])
+    lines += [
+        "",
+        f"| {'task':{width}} | successes | attempts | rate    |",
+        f"| {'-' * width} | --------- | -------- | ------- |",
+    ]
+    for task, c in summary["tasks"].items():
+        lines.append(
+            f"| {task:{width}} | {c['successes']:9} | {c['attempts']:8} | {100 * c['rate']:5.1f} % |"
+        )
+    lines += [
+        "",
+        f"Local success rate (all attempted commands): {100 * summary['local_success_rate']:.2f} %",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Runs the command; returns 0, or 2 after an error the user can mend."""
+    try:
+        config = draccus.parse(ReportConfig)
+        summary = report(config)
+    except (OSError, ValueError, DraccusException) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(as_markdown(summary))
+    print(f"report.json, report.md and the plots are in {config.output_dir or config.eval_dir}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""The hand-written v3 files against LeRobot's own recorder on the same frames."""
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from fake_calvin import write_calvin
+
+from dataset_convert.convert import ConvertConfig, convert
+from dataset_convert.writer import IMAGE_KEYS, dataset_features, episode_stats
+
+CAMERA_OF = {key: camera for camera, key in IMAGE_KEYS.items()}
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["vectors", "videos"])
+def both(request, tmp_path_factory):
+    """(ours, LeRobot's, source): the same four windows written in the two ways."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.utils.constants import DEFAULT_FEATURES
+
+    folder = tmp_path_factory.mktemp("both")
+    videos = request.param
+    source = write_calvin(folder / "calvin", rgb=videos, overlap=2, length=10)
+    ours = convert(ConvertConfig(source.root, "me/desk", folder / "ours", videos=videos))
+    features = {k: v for k, v in dataset_features("rel", videos).items() if k not in DEFAULT_FEATURES}
+    theirs = LeRobotDataset.create("me/desk", 30, features, folder / "theirs", "panda", use_videos=videos)
+    for start, end, _, sentence in source.windows:
+        for frame in range(start, end):
+            content = source.frames[frame]
+            vectors = {
+                "observation.state": content["robot_obs"],
+                "observation.environment_state": content["scene_obs"],
+                "action": content["rel_actions"],
+                "calvin.actions": content["actions"],
+            }
+            item = {key: value.astype(np.float32) for key, value in vectors.items()}
+            item["calvin.frame"] = np.array([frame])
+            if videos:
+                item |= {key: content[camera] for key, camera in CAMERA_OF.items()}
+            theirs.add_frame({**item, "task": sentence})
+        theirs.save_episode(parallel_encoding=False)
+    theirs.finalize()
+    return LeRobotDataset("me/desk", root=ours), LeRobotDataset("me/desk", root=folder / "theirs"), source
+
+
+def test_every_item_is_equal(both):
+    ours, theirs, source = both
+    assert len(ours) == len(theirs) == 40
+    for a, b in zip(ours, theirs, strict=True):
+        assert a.keys() == b.keys()
+        for key, value in a.items():
+            if key in CAMERA_OF:
+                picture = source.frames[a["calvin.frame"].item()][CAMERA_OF[key]]
+                wanted = picture.transpose(2, 0, 1) / 255
+                np.testing.assert_allclose(
+                    value, wanted, atol=0.02, err_msg="a frame of another time would be off"
+                )
+            elif isinstance(value, str):
+                assert value == b[key]
+            else:
+                assert value.dtype == b[key].dtype
+                np.testing.assert_array_equal(value, b[key])
+
+
+def test_the_description_is_equal(both):
+    ours, theirs, _ = both
+    a, b = ours.meta.info.to_dict(), theirs.meta.info.to_dict()
+    assert a == b
+    assert ours.meta.tasks.equals(theirs.meta.tasks)
+
+
+def test_the_parquet_files_have_the_same_columns(both):
+    ours, theirs, _ = both
+    for name in ("data", "meta/episodes"):
+        path = f"{name}/chunk-000/file-000.parquet"
+        a, b = pq.read_schema(ours.root / path), pq.read_schema(theirs.root / path)
+        assert dict(zip(a.names, a.types, strict=True)) == dict(zip(b.names, b.types, strict=True))
+    data = pq.ParquetFile(ours.root / "data/chunk-000/file-000.parquet")
+    assert data.num_row_groups == 4
+
+
+def test_statistics_are_lerobots(both):
+    ours, theirs, _ = both
+    assert ours.meta.stats.keys() == theirs.meta.stats.keys()
+    for key, expected in theirs.meta.stats.items():
+        stats = ours.meta.stats[key]
+        assert stats.keys() == expected.keys()
+        # LeRobot reads quantiles from 5000 bins and computes in float32.
+        spread = np.max(expected["max"] - expected["min"])
+        for name, value in expected.items():
+            assert stats[name].shape == value.shape, (key, name)
+            np.testing.assert_allclose(
+                stats[name], value, rtol=1e-5, atol=2e-3 * spread + 1e-6, err_msg=f"{key} {name}"
+            )
+
+
+@pytest.mark.parametrize("length", [1, 2, 33, 64])
+def test_episode_statistics_match_lerobots_for_every_length(length):
+    from lerobot.datasets.compute_stats import compute_episode_stats
+
+    rng = np.random.default_rng(length)
+    columns = {
+        "action": rng.normal(size=(length, 7)).astype(np.float32),
+        "constant": np.full((length, 2), 3.0, np.float32),
+        "calvin.frame": np.arange(length) + 70,
+    }
+    features = {key: {"dtype": str(column.dtype)} for key, column in columns.items()}
+    expected, stats = compute_episode_stats(columns, features), episode_stats(columns, {})
+    for key, of_key in expected.items():
+        for name, value in of_key.items():
+            assert stats[key][name].shape == value.shape
+            atol = 2e-3 * np.ptp(columns[key]) + 1e-6
+            np.testing.assert_allclose(stats[key][name], value, rtol=1e-5, atol=atol, err_msg=f"{key} {name}")
+
+
+def test_lerobots_tools_work_on_the_result(both, tmp_path):
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.dataset_tools import delete_episodes
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    ours, _, source = both
+    fewer = delete_episodes(ours, [0, 2], output_dir=tmp_path / "fewer", repo_id="me/fewer")
+    frames = [
+        frame for start, end, *_ in (source.windows[1], source.windows[3]) for frame in range(start, end)
+    ]
+    assert [item["calvin.frame"].item() for item in fewer] == frames
+    kept = np.stack([source.frames[frame]["robot_obs"] for frame in frames])
+    np.testing.assert_allclose(fewer.meta.stats["observation.state"]["mean"], kept.mean(axis=0), atol=1e-5)
+
+    aggregate_datasets(["me/a", "me/b"], "me/ab", roots=[ours.root, ours.root], aggr_root=tmp_path / "ab")
+    merged = LeRobotDataset("me/ab", root=tmp_path / "ab")
+    assert (merged.num_episodes, merged.num_frames) == (8, 80)
+    assert merged[45]["calvin.frame"] == ours[5]["calvin.frame"]
+    for key in set(merged[45]) & set(CAMERA_OF):
+        np.testing.assert_allclose(merged[45][key], ours[5][key], atol=0.01)
+
+
+def test_action_chunks_of_other_policies_stop_at_the_window_end(both):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    ours, _, _ = both
+    dataset = LeRobotDataset(
+        "me/desk", root=ours.root, delta_timestamps={"action": [i / 30 for i in range(4)]}
+    )
+    assert dataset[8]["action_is_pad"].tolist() == [False, False, True, True]
+    np.testing.assert_array_equal(dataset[8]["action"][1], ours[9]["action"])
