@@ -140,7 +140,7 @@ def _unstack(start: Snapshot, end: Snapshot) -> bool:
 
 def _joint(name: str, change: float) -> Task:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
-        return (getattr(end, name) - getattr(start, name)) * np.sign(change) > abs(change)
+        return bool((getattr(end, name) - getattr(start, name)) * np.sign(change) > abs(change))
 
     return fulfilled
 

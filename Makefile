@@ -1,0 +1,35 @@
+# Two commands: `make quickstart` and `make test`. Each sets up what it needs; a second run is quick.
+#   PYTHON=/path/to/python3.12   chooses the interpreter when the search does not find the one you want
+
+.PHONY: help install quickstart test lint benchmarks clean
+
+help:
+	@echo "make quickstart   environment, demonstrations, conversion, training, evaluation, report"
+	@echo "make test         environment, all tests"
+	@echo "make install      environment only: .venv with the plugin installed editable"
+	@echo "make lint         ruff and mypy"
+	@echo "make benchmarks   the speed tables of docs/benchmarks.md"
+
+install: .venv/.installed
+
+.venv/.installed: pyproject.toml constraints.txt scripts/install.sh scripts/find_python.sh
+	@PYTHON="$(PYTHON)" sh scripts/install.sh
+
+quickstart: install
+	@.venv/bin/python scripts/quickstart.py
+
+test: install
+	@.venv/bin/python -m pytest
+
+lint: install
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+benchmarks: install
+	.venv/bin/python benchmarks/desk.py --output=outputs/benchmarks/desk.json
+	.venv/bin/python benchmarks/policy_latency.py --output=outputs/benchmarks/policy_latency.json
+	.venv/bin/python benchmarks/training.py --output=outputs/benchmarks/training.json
+
+clean:
+	rm -rf .venv outputs data/quickstart

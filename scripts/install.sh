@@ -1,0 +1,35 @@
+#!/bin/sh
+# Makes .venv in the checkout and installs the plugin editable with everything it needs.
+set -eu
+python=$(sh scripts/find_python.sh)
+command -v c++ >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || {
+    echo "A C++ compiler is needed to build pybullet (for example: apt install g++)." >&2
+    exit 1
+}
+if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info < (3, 12))' >/dev/null 2>&1; then
+    rm -rf .venv
+    "$python" -m venv .venv
+fi
+if command -v uv >/dev/null 2>&1; then
+    uv=uv
+else
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check uv
+    uv=.venv/bin/uv
+fi
+echo "installing with $python (torch and pybullet take some minutes the first time)"
+"$uv" pip install --python .venv/bin/python --constraint constraints.txt --editable '.[dev]'
+
+# A pybullet built without numpy may wait in uv's cache and would be reused silently.
+numpy_enabled() {
+    .venv/bin/python -c 'import pybullet, sys; sys.exit(not pybullet.isNumpyEnabled())' >/dev/null
+}
+if ! numpy_enabled; then
+    echo "pybullet came without numpy support: building it again"
+    "$uv" pip install --python .venv/bin/python --constraint constraints.txt \
+        --reinstall-package pybullet --refresh-package pybullet --no-cache --editable '.[dev]'
+    numpy_enabled || {
+        echo "pybullet still lacks numpy support; see 'Installing pybullet' in README.md" >&2
+        exit 1
+    }
+fi
+touch .venv/.installed

@@ -1,0 +1,158 @@
+"""The whole line with LeRobot's own commands: record, convert, train, evaluate, report. Run by ``make quickstart``.
+
+Every step is a command printed before it runs, so each can be repeated by hand. Steps whose result is there already
+are not repeated. Ends with outputs/quickstart/summary.json.
+"""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+BIN = Path(sys.executable).parent
+DATA = Path("data/quickstart")
+OUT = Path("outputs/quickstart")
+CONFIG = "configs/quickstart.yaml"
+TASKS = [
+    "open_drawer",
+    "close_drawer",
+    "move_slider_left",
+    "move_slider_right",
+    "turn_on_lightbulb",
+    "turn_off_lightbulb",
+    "turn_on_led",
+    "turn_off_led",
+    "lift_red_block_table",
+]
+EPISODES_PER_TASK = 10
+EVALUATION_SEED = 100_000  # far from the demonstrations' seed: starts that were never recorded
+
+
+def run(title: str, *command: object) -> None:
+    """Runs one of the installed commands in the checkout and stops the quickstart when it fails."""
+    words = [str(word) for word in command]
+    print(f"\n=== {title}\n$ {shlex.join(words)}", flush=True)
+    environment = {
+        **os.environ,
+        "HF_HUB_OFFLINE": "1",
+        "WANDB_MODE": "disabled",
+        "TOKENIZERS_PARALLELISM": "false",
+    }
+    started = time.time()
+    code = subprocess.run([str(BIN / words[0]), *words[1:]], cwd=ROOT, env=environment).returncode
+    if code:
+        sys.exit(f"quickstart stopped: `{words[0]}` ended with exit code {code}; its message is above")
+    print(f"--- {title}: {time.time() - started:.0f} s", flush=True)
+
+
+def record_and_convert() -> None:
+    """Demonstrations without pictures (state and language suffice here), then a LeRobotDataset of them."""
+    if not (DATA / "validation").exists():
+        run(
+            "record demonstrations",
+            "lansar-record",
+            "--scene=D",
+            f"--tasks=[{','.join(TASKS)}]",
+            "--episodes=1080",
+            "--validation_episodes=45",
+            "--cameras=[]",
+            "--seed=0",
+            "--workers=2",
+            f"--output_dir={DATA}",
+        )
+    if not (DATA / "lerobot").exists():
+        run(
+            "convert to a LeRobotDataset",
+            "lansar-convert",
+            f"--root={DATA}",
+            "--split=training",
+            "--repo_id=lansar/quickstart",
+            "--videos=false",
+            f"--output_dir={DATA / 'lerobot'}",
+        )
+
+
+def train(name: str, *options: str) -> Path:
+    """Trains with the quickstart's config file; returns the checkpoint."""
+    checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
+    if not checkpoint.exists():
+        shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses a folder that an interrupted run left
+        run(f"train ({name})", "lerobot-train", f"--config_path={CONFIG}", f"--output_dir={OUT / name}", *options)
+    return checkpoint
+
+
+def evaluate(name: str, checkpoint: Path) -> Path:
+    """Evaluates every task from unseen starts, with the report."""
+    folder = OUT / f"eval_{name}"
+    if not (folder / "eval_info.json").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        run(
+            f"evaluate ({name})",
+            "lerobot-eval",
+            f"--policy.path={checkpoint}",
+            "--env.type=calvin",
+            f"--env.task={','.join(TASKS)}",
+            "--env.control_mode=abs",
+            "--env.cameras=[]",
+            "--env.render_fps=6",
+            f"--env.results_dir={folder / 'episodes'}",
+            f"--eval.n_episodes={EPISODES_PER_TASK}",
+            "--eval.batch_size=10",
+            f"--seed={EVALUATION_SEED}",
+            f"--output_dir={folder}",
+        )
+    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}")
+    return folder
+
+
+def success(folder: Path) -> dict[str, dict[str, float]]:
+    """Episodes and success rate of every task, from LeRobot's eval_info.json."""
+    info = json.loads((folder / "eval_info.json").read_text())
+    rates = {}
+    for entry in info["per_task"]:
+        successes = entry["metrics"]["successes"]
+        rates[entry["task_group"]] = {
+            "episodes": len(successes),
+            "success_rate": sum(successes) / len(successes),
+        }
+    return rates
+
+
+def total(tasks: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Episodes and success rate over all tasks."""
+    episodes = sum(task["episodes"] for task in tasks.values())
+    solved = sum(task["episodes"] * task["success_rate"] for task in tasks.values())
+    return {"episodes": int(episodes), "success_rate": round(solved / episodes, 4)}
+
+
+def main() -> None:
+    """Runs the line and writes the summary."""
+    os.chdir(ROOT)
+    started = time.time()
+    record_and_convert()
+    trained = evaluate("trained", train("train"))
+    # One update with learning rate 0: the same network and statistics, untrained weights.
+    untrained = evaluate("untrained", train("untrained", "--steps=1", "--policy.learning_rate=0"))
+    tasks = success(trained)
+    summary = {
+        "trained": total(tasks),
+        "untrained": total(success(untrained)),
+        "tasks": tasks,
+        "minutes": round((time.time() - started) / 60, 1),
+    }
+    file = OUT / "summary.json"
+    if file.exists():  # a repeated run only looks at results: keep the time that making them took
+        summary["minutes"] = max(summary["minutes"], json.loads(file.read_text())["minutes"])
+    file.write_text(json.dumps(summary, indent=2) + "\n")
+    print(f"\n{json.dumps(summary, indent=2)}\n\nsummary: {file}")
+    print(f"report and plots: {trained}/report.md   rollout videos: {trained}/videos/")
+    print("Built-in desk, state and language policy: these are not CALVIN benchmark numbers.")
+
+
+if __name__ == "__main__":
+    main()

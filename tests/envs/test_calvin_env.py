@@ -1,0 +1,161 @@
+"""The gymnasium environment: chains, single tasks, rewards, ends of episodes, vector environments."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import lerobot_lansar  # noqa: F401  (registers the environment)
+from lerobot_lansar.demos.demonstrator import _error, _toward
+from lerobot_lansar.demos.skills import SKILLS, View
+from lerobot_lansar.desk import DeskError
+from lerobot_lansar.envs import CalvinEnv
+from lerobot_lansar.envs.benchmark import load_chains
+
+NOTHING = np.array([0, 0, 0, 0, 0, 0, 1.0])
+
+
+def script(env, obs, tasks, seed=0):
+    """Carries out ``tasks`` one after the other with the demonstrator's skills; yields what each step returned."""
+    for task in tasks:
+        state = obs["agent_pos"], obs["environment_state"]
+        view = View(env.unwrapped._desk.scene, *state, np.random.default_rng(seed))
+        for waypoint in SKILLS[task](view):
+            for _ in range(70):
+                distance, turn = _error(waypoint, view.robot_obs)
+                if np.linalg.norm(distance) < waypoint.tolerance and np.abs(turn).max() < 0.12:
+                    break
+                result = env.step(_toward(waypoint, view.robot_obs, distance, turn, 0.9))
+                obs = result[0]
+                view.robot_obs, view.scene_obs = obs["agent_pos"], obs["environment_state"]
+                yield result
+                if result[1] or result[2]:
+                    break
+            if result[1] or result[2]:
+                break
+
+
+@pytest.mark.parametrize("mode", ["rel", "abs"])
+def test_passes_gymnasiums_checker(mode):
+    env = gymnasium.make("lerobot_lansar/Calvin-v0", control_mode=mode, cameras=("gripper",))
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_seed_chooses_the_chain_and_reset_without_seed_does_not_count_chains():
+    env = CalvinEnv(cameras=())
+    for seed, chain in ((0, 0), (1007, 7), (7, 7)):
+        obs, _ = env.reset(seed=seed)
+        np.testing.assert_allclose(obs["environment_state"][:2], load_chains()[chain].scene_obs[:2], atol=1e-3)
+        assert env._commands == load_chains()[chain].tasks
+    env.reset(seed=3)
+    env.reset()
+    env.reset(seed=4)
+    assert env._chain == 4
+    env.close()
+
+
+def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_path):
+    # the first chain that starts with two tasks that the demonstrator knows
+    chain, tasks = next(
+        (k, chain.tasks) for k, chain in enumerate(load_chains()) if set(chain.tasks[:2]) <= set(SKILLS)
+    )
+    env = CalvinEnv(control_mode="abs", cameras=(), steps_per_command=200, results_dir=str(tmp_path))
+    obs, info = env.reset(seed=chain)
+    sentences, rewards = [env.task_description], []
+    for obs, reward, terminated, truncated, info in script(env, obs, tasks[:2]):
+        rewards.append(reward)
+        sentences.append(env.task_description)
+        assert not truncated
+    assert sum(rewards) == 2
+    assert info == {"is_success": False, "successes": 2}
+    assert list(dict.fromkeys(sentences)) == [env._sentences[task][0] for task in tasks[:3]]
+    steps = 0
+    while not terminated:
+        stay = np.concatenate([obs["agent_pos"][:6], [1]])
+        obs, reward, terminated, truncated, info = env.step(stay)
+        steps += 1
+    assert steps == 200
+    assert reward == 0
+    (file,) = tmp_path.iterdir()
+    episode = json.loads(file.read_text())
+    assert episode["chain"] == chain
+    assert episode["successes"] == 2
+    assert [c["success"] for c in episode["commands"]] == [True, True, False]
+    assert episode["commands"][2]["steps"] == 200
+    env.close()
+
+
+@pytest.mark.parametrize("task", ["open_drawer", "turn_off_led", "lift_red_block_table"])
+def test_single_task_succeeds_when_the_oracle_says_so(task):
+    env = CalvinEnv(task, control_mode="abs", cameras=())
+    obs, info = env.reset(seed=1)
+    assert not info["is_success"]
+    *_, (obs, reward, terminated, _, info) = script(env, obs, [task])
+    assert (reward, terminated, info["is_success"]) == (1.0, True, True)
+    env.close()
+
+
+def test_an_episode_depends_on_its_seed_alone():
+    def episode(env, seed):
+        obs, _ = env.reset(seed=seed)
+        states = [obs["environment_state"]]
+        for _ in range(10):
+            states.append(env.step(NOTHING)[0]["environment_state"])
+        return np.array(states)
+
+    a, b = CalvinEnv("stack_block", cameras=()), CalvinEnv("stack_block", cameras=())
+    first = episode(a, 5)
+    episode(b, 6)
+    np.testing.assert_array_equal(episode(b, 5), first)
+    a.close()
+    b.close()
+
+
+def test_actions_of_the_other_control_mode_are_refused_at_once():
+    env = CalvinEnv("open_drawer", cameras=(), control_mode="rel")
+    obs, _ = env.reset(seed=0)
+    with pytest.raises(DeskError, match=r"--env\.control_mode=abs"):
+        env.step(np.concatenate([obs["agent_pos"][:6], [1]]))
+    env.close()
+    env = CalvinEnv("open_drawer", cameras=(), control_mode="abs")
+    env.reset(seed=0)
+    with pytest.raises(DeskError, match=r"--env\.control_mode=rel"):
+        env.step([0.3, -0.2, 0.1, 0, 0, 0.4, 1])
+    env.close()
+
+
+def test_pictures_are_drawn_at_the_rate_asked_for():
+    env = CalvinEnv("open_drawer", cameras=(), render_fps=10)
+    env.reset(seed=0)
+    pictures = [env.render()]
+    for _ in range(4):
+        env.step([1, 0, 0, 0, 0, 0, 1])
+        pictures.append(env.render())
+    assert pictures[0].shape == (200, 200, 3)
+    assert [p is pictures[0] for p in pictures] == [True, True, True, False, False]
+    env.close()
+
+
+def test_options_are_checked_by_name(tmp_path):
+    with pytest.raises(DeskError, match="'juggle' is unknown"):
+        CalvinEnv("juggle")
+    with pytest.raises(DeskError, match="chains start in scene D"):
+        CalvinEnv(scene="A")
+    with pytest.raises(DeskError, match="'joint' is unknown"):
+        CalvinEnv(control_mode="joint")
+    with pytest.raises(DeskError, match="does not exist"):
+        CalvinEnv(annotations=str(tmp_path / "none.yaml"))
+    with pytest.raises(DeskError, match="reset the environment"):
+        CalvinEnv().step(NOTHING)
+
+
+def test_annotations_file_replaces_sentences(tmp_path):
+    file = tmp_path / "sentences.yaml"
+    file.write_text("open_drawer: ['pull that thing']\n")
+    assert CalvinEnv("open_drawer", annotations=str(file)).task_description == "pull that thing"
+    file.write_text("open_door: ['no']\n")
+    with pytest.raises(DeskError, match="unknown task 'open_door'"):
+        CalvinEnv("open_drawer", annotations=str(file))

@@ -1,0 +1,61 @@
+"""``--env.type=calvin``: what LeRobot's evaluation gets to see."""
+
+import numpy as np
+import pytest
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.factory import make_env
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
+import lerobot_policy_lansar  # noqa: F401  (registers the environment)
+from lerobot_lansar.desk import DeskError
+from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
+
+
+def test_is_registered_under_its_name():
+    assert EnvConfig.get_choice_class("calvin") is CalvinEnvConfig
+
+
+def test_features_follow_the_cameras():
+    features = env_to_policy_features(CalvinEnvConfig(cameras=["gripper"]))
+    assert {key: feature.shape for key, feature in features.items()} == {
+        "action": (7,),
+        "observation.state": (15,),
+        "observation.environment_state": (24,),
+        "observation.images.gripper": (3, 84, 84),
+    }
+    with pytest.raises(DeskError, match=r"--env\.cameras: 'wrist'"):
+        CalvinEnvConfig(cameras=["wrist"])
+
+
+def rollout(use_async: bool):
+    config = CalvinEnvConfig(task="open_drawer, turn_on_led", cameras=[], steps_per_command=4)
+    envs = make_env(config, n_envs=2, use_async_envs=use_async)
+    assert list(envs) == ["open_drawer", "turn_on_led"]
+    vector = envs["open_drawer"][0]
+    obs, _ = vector.reset(seed=[3, 4], options={"lerobot_new_rollout": True})
+    assert vector.call("task_description") == ("open the drawer", "open the drawer")
+    assert vector.call("_max_episode_steps") == (4, 4)
+    states, ends = [obs["agent_pos"]], []
+    action = np.tile([1.0, 0, 0, 0, 0, 0, 1], (2, 1))
+    for _ in range(7):
+        obs, rewards, terminated, _, info = vector.step(action)
+        assert (rewards == 0).all()
+        states.append(obs["agent_pos"])
+        ends.append(terminated.copy())
+    prepared = preprocess_observation(obs)
+    for tasks in envs.values():
+        tasks[0].close()
+    return np.array(states), np.array(ends), prepared
+
+
+def test_sync_and_async_agree_and_finished_episodes_freeze():
+    states, ends, prepared = rollout(use_async=False)
+    assert ends[:3].sum() == 0
+    assert ends[3].all()
+    np.testing.assert_array_equal(states[5], states[4])
+    np.testing.assert_array_equal(states[7], states[4])
+    assert prepared["observation.state"].shape == (2, 15)
+    assert prepared["observation.control_mode"].tolist() == [[0.0], [0.0]]
+    other_states, other_ends, _ = rollout(use_async=True)
+    np.testing.assert_array_equal(other_states, states)
+    np.testing.assert_array_equal(other_ends, ends)
