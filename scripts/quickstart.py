@@ -82,7 +82,13 @@ def train(name: str, *options: str) -> Path:
     checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
     if not checkpoint.exists():
         shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses a folder that an interrupted run left
-        run(f"train ({name})", "lerobot-train", f"--config_path={CONFIG}", f"--output_dir={OUT / name}", *options)
+        run(
+            f"train ({name})",
+            "lerobot-train",
+            f"--config_path={CONFIG}",
+            f"--output_dir={OUT / name}",
+            *options,
+        )
     return checkpoint
 
 

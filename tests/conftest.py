@@ -1,4 +1,4 @@
-"""What all tests share: an offline LeRobot with its caches in a temporary folder, and the recordings to test against."""
+"""What all tests share: an offline LeRobot, and where the recordings of the original simulator are."""
 
 import os
 from pathlib import Path

@@ -94,14 +94,14 @@ def publish_split(
         },
         "info": {"episodes": [], "indx": [tuple(int(v) for v in row) for row in windows]},
     }
-    np.save(partial / "lang_annotations" / "auto_lang_ann.npy", annotations, allow_pickle=True)  # type: ignore[arg-type]
+    _save(partial / "lang_annotations" / "auto_lang_ann.npy", annotations)
     if target.name == "validation":
         sentences = {task: {"ann": [listed[0]]} for task, listed in commands.items()}
-        np.save(partial / "lang_annotations" / "embeddings.npy", sentences, allow_pickle=True)  # type: ignore[arg-type]
+        _save(partial / "lang_annotations" / "embeddings.npy", sentences)
     np.save(partial / "ep_start_end_ids.npy", windows - [0, 1])  # first and last frame, both inclusive
     np.save(partial / "ep_lens.npy", windows[:, 1] - windows[:, 0])
     scenes = {f"calvin_scene_{scene.name}": [first_frame, number - 1]}
-    np.save(partial / "scene_info.npy", scenes, allow_pickle=True)  # type: ignore[arg-type]
+    _save(partial / "scene_info.npy", scenes)
     statistics = {
         key: {"mean": np.mean(values, 0).tolist(), "std": np.std(values, 0).tolist()}
         for key, values in states.items()
@@ -111,6 +111,11 @@ def publish_split(
     (partial / ".hydra" / "merged_config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     partial.rename(target)
     return number
+
+
+def _save(file: Path, content: dict[str, Any]) -> None:
+    """A pickled dictionary, CALVIN's way of keeping them."""
+    np.save(file, np.array(content, dtype=object), allow_pickle=True)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -77,7 +77,7 @@ def demonstrate(desk: Desk, task: str, rng: np.random.Generator, noise: float = 
             arrived = np.linalg.norm(distance) < waypoint.tolerance and np.abs(turn).max() < 0.12
             if arrived and held >= waypoint.hold:
                 break
-            held += arrived
+            held += int(arrived)
             action = _toward(waypoint, obs["robot_obs"], distance, turn, speed)
             rows.append({**obs, "actions": action, "rel_actions": relative_action(action, obs["robot_obs"])})
             obs = desk.step(disturbance.of(action), control_mode="abs")
@@ -125,7 +125,8 @@ class _Disturbance:
 
     def __init__(self, noise: float, rng: np.random.Generator):
         self._noise, self._rng = noise, rng
-        self._push, self._left = np.zeros(6), 0
+        self._push: np.ndarray = np.zeros(6)
+        self._left = 0
 
     def of(self, action: np.ndarray) -> np.ndarray:
         """The action that is really executed, (7,)."""

@@ -52,7 +52,9 @@ class RecordConfig:
         """Raises DeskError for options that cannot be carried out."""
         for task in self.tasks:
             if task not in SKILLS:
-                raise DeskError(f"--tasks: {task!r} cannot be demonstrated; choose among: {', '.join(SKILLS)}")
+                raise DeskError(
+                    f"--tasks: {task!r} cannot be demonstrated; choose among: {', '.join(SKILLS)}"
+                )
         if not self.tasks:
             raise DeskError("--tasks must name at least one task")
         for name in ("episodes", "validation_episodes", "workers"):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..desk import COLORS
-from ..desk.scenes import BLOCK_LENGTHS, BUTTON_TRAVEL, SWITCH_TRAVEL, Scene
+from ..desk.scenes import BLOCK_LENGTHS, BUTTON_TRAVEL, Scene
 
 OPEN, CLOSED = 1.0, -1.0
 ABOVE = 0.58
@@ -59,7 +59,13 @@ class View:
         return self.scene_obs[index : index + 6]
 
     def go(
-        self, x: float, y: float, z: float, gripper: float = CLOSED, euler: np.ndarray | None = None, **options: float
+        self,
+        x: float,
+        y: float,
+        z: float,
+        gripper: float = CLOSED,
+        euler: np.ndarray | None = None,
+        **options: float,
     ) -> Waypoint:
         """A waypoint, gripper down unless ``euler`` says otherwise."""
         if euler is None:
@@ -143,7 +149,9 @@ def turn_off_lightbulb(view: View) -> Iterator[Waypoint]:
         yield view.go(lever[0] + x, lever[1] - 0.03, lever[2] + 0.09, euler=tilt, tolerance=0.02)
         yield view.go(lever[0] + x, lever[1] + 0.005, lever[2] + 0.045, euler=tilt, slow=0.9)
         for down in np.linspace(0.0, 0.11, 6):
-            yield view.go(lever[0] + x, lever[1] + 0.005 - 0.55 * down, lever[2] + 0.03 - down, euler=tilt, slow=0.8)
+            yield view.go(
+                lever[0] + x, lever[1] + 0.005 - 0.55 * down, lever[2] + 0.03 - down, euler=tilt, slow=0.8
+            )
 
 
 def _lift_from_table(color: str) -> Skill:

@@ -141,7 +141,9 @@ def _desk(scene: Scene, folder: Path) -> str:
     ]  # fmt: skip
     links = [
         _link("base_link", 0.0, _base(scene, folder)),
-        _link("button_link", 0.1538, _shape('<cylinder radius="0.031" length="0.022"/>', BLACK, (0, 0, 0.012))),
+        _link(
+            "button_link", 0.1538, _shape('<cylinder radius="0.031" length="0.022"/>', BLACK, (0, 0, 0.012))
+        ),
         _link("switch_link", 0.2388, _switch(scene)),
         _link("slide_link", 1.5435, _slide(scene)),
         _link("drawer_link", 4.2313, _drawer(scene)),
@@ -259,7 +261,9 @@ def _robot() -> str:
     pad_contact = '<contact><lateral_friction value="1"/><spinning_friction value="0.001"/></contact>'
     for side, sign in (("left", 1), ("right", -1)):
         pad = _box((-0.0093, 0.0093), tuple(sorted((sign * 0.0009, sign * 0.0049))), (0.0707, 0.0957), BLACK)  # type: ignore[arg-type]
-        extra.append(_joint(f"joint_finger_tip_{side}", f"finger_{side}_tip", (0, 0, 0), parent=f"panda_{side}finger"))
+        extra.append(
+            _joint(f"joint_finger_tip_{side}", f"finger_{side}_tip", (0, 0, 0), parent=f"panda_{side}finger")
+        )
         extra.append(_link(f"finger_{side}_tip", 1e-4, pad, pad_contact))
     for element in extra:
         root.append(ElementTree.fromstring(element))

@@ -161,7 +161,9 @@ def load_commands(file: str | Path | None) -> dict[str, list[str]]:
         raise DeskError(f"annotations file {path} does not exist")
     content = yaml.safe_load(path.read_text())
     if not isinstance(content, dict):
-        raise DeskError(f"annotations file {path} must map task names to sentences, got {type(content).__name__}")
+        raise DeskError(
+            f"annotations file {path} must map task names to sentences, got {type(content).__name__}"
+        )
     commands = dict(COMMANDS)
     for task, sentences in content.items():
         if task not in TASKS:

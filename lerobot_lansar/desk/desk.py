@@ -132,7 +132,9 @@ class Desk:
         """``robot_obs``, ``scene_obs`` and a picture ``rgb_<camera>`` (uint8) per camera."""
         obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
         if not all(np.isfinite(state).all() for state in obs.values()):
-            raise SimulationError("the simulation diverged: a state is no longer finite; reset the desk to go on")
+            raise SimulationError(
+                "the simulation diverged: a state is no longer finite; reset the desk to go on"
+            )
         for camera in self.cameras:
             obs[f"rgb_{camera}"] = self.render(camera)
         return obs
@@ -234,7 +236,9 @@ class Desk:
             poses = []
             for _ in COLORS:
                 area = areas[rng.integers(len(areas))]
-                poses.append([rng.uniform(*area.x), rng.uniform(*area.y), 0.46, 0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+                poses.append(
+                    [rng.uniform(*area.x), rng.uniform(*area.y), 0.46, 0.0, 0.0, rng.uniform(-np.pi, np.pi)]
+                )
             # the longest block's half diagonal is 0.045 m
             if all(np.hypot(a[0] - b[0], a[1] - b[1]) > 0.09 for a, b in itertools.combinations(poses, 2)):
                 return np.array([0.0] * 6 + [x for pose in poses for x in pose])

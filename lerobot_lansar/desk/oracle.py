@@ -165,7 +165,11 @@ def _tasks() -> dict[str, Task]:
     tasks["open_drawer"] = _joint("drawer", 0.12)
     tasks["close_drawer"] = _joint("drawer", -0.12)
     for color in COLORS:
-        for surface, touch, height in (("table", TABLE, 0.05), ("slider", PLANK, 0.03), ("drawer", DRAWER, 0.05)):
+        for surface, touch, height in (
+            ("table", TABLE, 0.05),
+            ("slider", PLANK, 0.03),
+            ("drawer", DRAWER, 0.05),
+        ):
             tasks[f"lift_{color}_block_{surface}"] = _lift(color, height, touch)
     tasks["place_in_slider"] = _place(PLANK)
     tasks["place_in_drawer"] = _place(DRAWER)

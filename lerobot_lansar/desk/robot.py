@@ -64,8 +64,8 @@ class Robot:
             physicsClientId=client,
         )
         self.gripper_action = 1.0
-        self._target_position = np.zeros(3)
-        self._target_euler = np.zeros(3)
+        self._target_position: np.ndarray = np.zeros(3)
+        self._target_euler: np.ndarray = np.zeros(3)
 
     def reset(self, robot_obs: np.ndarray | None) -> None:
         """Sets the arm's joints and half the opening width for each finger; the TCP part of ``robot_obs`` is ignored.
@@ -93,11 +93,11 @@ class Robot:
         if relative:
             self._target_position += action[:3] * POSITION_STEP
             self._target_euler += action[3:6] * ANGLE_STEP
-            position, euler = self._target_position, self._target_euler
+            pose = self._target_position, self._target_euler
         else:
-            position, euler = action[:3], action[3:6]
+            pose = action[:3], action[3:6]
         self.gripper_action = 1.0 if action[6] > 0 else -1.0
-        for joint, value in zip(ARM, self.joints_for(position, euler), strict=True):
+        for joint, value in zip(ARM, self.joints_for(*pose), strict=True):
             self._drive(joint, value, force=200, max_velocity=2)
         opening = self.gripper_action > 0
         for joint in FINGERS:

@@ -64,7 +64,9 @@ _BEHIND = (0.05, 0.12)
 _FRONT = (-0.15, -0.03)
 
 
-def _areas(table: tuple[float, float], left: tuple[float, float], right: tuple[float, float]) -> dict[str, Area]:
+def _areas(
+    table: tuple[float, float], left: tuple[float, float], right: tuple[float, float]
+) -> dict[str, Area]:
     return {
         "table": Area(table, _FRONT),
         "slider_left": Area(left, _BEHIND),

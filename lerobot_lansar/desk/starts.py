@@ -1,4 +1,4 @@
-"""Start states in which a given task can be carried out, drawn at random: for single-task episodes and demonstrations."""
+"""Random start states in which a given task can be carried out, for single-task episodes and demonstrations."""
 
 import itertools
 
@@ -113,9 +113,9 @@ def _furniture(scene: Scene, task: str, rng: np.random.Generator) -> np.ndarray:
     slide = _joint(rng, scene.slide_travel, 0.17, {"move_slider_left": 0, "move_slider_right": 1}.get(task))
     needed = {"open_drawer": 0, "close_drawer": 1}.get(task)
     drawer = _joint(rng, DRAWER_TRAVEL, 0.14, needed)
-    if task.endswith("_drawer") and needed is None or task == "push_into_drawer":
+    if (task.endswith("_drawer") and needed is None) or task == "push_into_drawer":
         drawer = DRAWER_TRAVEL
-    if task.startswith("lift_") and task.endswith("_slider") or task == "place_in_slider":
+    if (task.startswith("lift_") and task.endswith("_slider")) or task == "place_in_slider":
         slide = scene.slide_travel * rng.integers(2)
     return np.array([slide, drawer, 0.0, SWITCH_TRAVEL * bulb, float(bulb), float(led)])
 
@@ -154,7 +154,8 @@ def _blocks(
         return None
     longest = max(BLOCK_LENGTHS.values()) / 2
     if any(
-        abs(pose[0] - scene.button_x) < longest + 0.04 and abs(pose[1] + 0.12) < longest + 0.04 for pose in others
+        abs(pose[0] - scene.button_x) < longest + 0.04 and abs(pose[1] + 0.12) < longest + 0.04
+        for pose in others
     ):
         return None  # half on the button's rim
     return poses

@@ -85,7 +85,9 @@ class CalvinEnv(gym.Env):
         if task != LH_MTLC and task not in TASKS:
             raise DeskError(f"task {task!r} is unknown; it is {LH_MTLC!r} or one of: {', '.join(TASKS)}")
         if task == LH_MTLC and scene != "D":
-            raise DeskError(f"the benchmark's chains start in scene D, not {scene!r}; name a single task for {scene!r}")
+            raise DeskError(
+                f"the benchmark's chains start in scene D, not {scene!r}; name a single task for {scene!r}"
+            )
         if control_mode not in CONTROL_MODES:
             raise DeskError(f"control_mode {control_mode!r} is unknown; it is 'rel' or 'abs'")
         if steps_per_command < 1 or not 1 <= render_fps <= CONTROL_HZ:
@@ -126,7 +128,9 @@ class CalvinEnv(gym.Env):
             start = sample_start(self._desk, self.task, np.random.default_rng(self._seed))
             obs = self._desk.reset(*start)
         self._done = []
-        self._picture: tuple[int, np.ndarray] | None = None  # the step it was drawn at, and the static picture
+        self._picture: tuple[int, np.ndarray] | None = (
+            None  # the step it was drawn at, and the static picture
+        )
         self._steps = 0
         self._begin_command()
         return self._observation(obs), self._info()
@@ -202,7 +206,10 @@ class CalvinEnv(gym.Env):
 
     def _info(self) -> dict[str, Any]:
         successes = sum(command["success"] for command in self._done)
-        return {"is_success": bool(self._commands) and successes == len(self._commands), "successes": successes}
+        return {
+            "is_success": bool(self._commands) and successes == len(self._commands),
+            "successes": successes,
+        }
 
     def _refuse_other_mode(self, action: np.ndarray) -> None:
         """Catches a policy of the other control mode at its first action, before it costs an evaluation.

@@ -58,7 +58,15 @@ class CalvinEnvConfig(EnvConfig):
     @property
     def gym_kwargs(self) -> dict:
         """Arguments of :class:`CalvinEnv`, without the task."""
-        names = ("scene", "assets", "cameras", "control_mode", "steps_per_command", "annotations", "results_dir")
+        names = (
+            "scene",
+            "assets",
+            "cameras",
+            "control_mode",
+            "steps_per_command",
+            "annotations",
+            "results_dir",
+        )
         return {name: getattr(self, name) for name in names} | {"render_fps": self.render_fps}
 
     def create_envs(

@@ -48,7 +48,9 @@ def test_folder_has_calvins_layout(recording):
         numbers = [int(file.stem.removeprefix("episode_")) for file in sorted(folder.glob("episode_*.npz"))]
         assert len(language["language"]["ann"]) == len(bounds) == episodes
         assert numbers == list(range(bounds[0, 0], bounds[-1, 1] + 1))
-        assert [end - 1 for _, end in language["info"]["indx"]] == bounds[:, 1].tolist()  # windows end exclusive
+        assert [end - 1 for _, end in language["info"]["indx"]] == bounds[
+            :, 1
+        ].tolist()  # windows end exclusive
         assert set(language["language"]["task"]) == {"turn_on_led", "lift_red_block_table"}
         assert np.load(folder / "scene_info.npy", allow_pickle=True).item() == {
             "calvin_scene_D": [numbers[0], numbers[-1]]
@@ -65,7 +67,9 @@ def test_folder_has_calvins_layout(recording):
 
 def test_rel_actions_follow_from_actions_and_robot_obs(recording):
     for frame in frames(recording / "training").values():
-        np.testing.assert_allclose(frame["rel_actions"], relative_action(frame["actions"], frame["robot_obs"]))
+        np.testing.assert_allclose(
+            frame["rel_actions"], relative_action(frame["actions"], frame["robot_obs"])
+        )
         assert np.abs(frame["rel_actions"]).max() <= 1
         moved = frame["rel_actions"][:3] * 0.02
         np.testing.assert_allclose(frame["robot_obs"][:3] + moved, frame["actions"][:3], atol=1e-9)
@@ -90,7 +94,9 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
         sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", "--seed=3", "--cameras=[]",
         "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4", "--validation_episodes=2",
     ]  # fmt: skip
-    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
     deadline = time.time() + 120
     while len(list((target / ".recording").glob("0*.json"))) < 2 and time.time() < deadline:
         time.sleep(0.02)

@@ -107,7 +107,9 @@ def test_start_states_are_feasible_and_not_yet_fulfilled(desk, task):
     start = desk.snapshot()
     np.testing.assert_allclose(obs["robot_obs"][7:14], robot_obs[7:14], atol=0.02)
     assert task not in desk.completed_tasks(start)
-    assert (len(start.touched_by_robot) == 1) == (task in ("place_in_slider", "place_in_drawer", "stack_block"))
+    assert (len(start.touched_by_robot) == 1) == (
+        task in ("place_in_slider", "place_in_drawer", "stack_block")
+    )
     again = sample_start(desk, task, np.random.default_rng(11))
     np.testing.assert_array_equal(again[1], scene_obs)
 

@@ -59,7 +59,12 @@ def _snapshot(info: dict) -> Snapshot:
     )
     doors, lights = info["doors"], info["lights"]
     return Snapshot(
-        doors["base__slide"], doors["base__drawer"], bool(lights["lightbulb"]), bool(lights["led"]), blocks, touched
+        doors["base__slide"],
+        doors["base__drawer"],
+        bool(lights["lightbulb"]),
+        bool(lights["led"]),
+        blocks,
+        touched,
     )
 
 
@@ -87,5 +92,7 @@ def test_pictures_equal_the_originals(golden, original_assets, tag):
     with Desk(tag[0], original_assets) as desk:
         obs = desk.reset(state["reset_robot_obs"], scene_obs)
     for camera in ("static", "gripper"):
-        expected = np.asarray(Image.open(golden / "images" / f"{tag}_{camera}.png").convert("RGB")).astype(int)
+        expected = np.asarray(Image.open(golden / "images" / f"{tag}_{camera}.png").convert("RGB")).astype(
+            int
+        )
         assert np.abs(obs[f"rgb_{camera}"] - expected).mean() < 0.02, camera

@@ -48,7 +48,9 @@ def test_seed_chooses_the_chain_and_reset_without_seed_does_not_count_chains():
     env = CalvinEnv(cameras=())
     for seed, chain in ((0, 0), (1007, 7), (7, 7)):
         obs, _ = env.reset(seed=seed)
-        np.testing.assert_allclose(obs["environment_state"][:2], load_chains()[chain].scene_obs[:2], atol=1e-3)
+        np.testing.assert_allclose(
+            obs["environment_state"][:2], load_chains()[chain].scene_obs[:2], atol=1e-3
+        )
         assert env._commands == load_chains()[chain].tasks
     env.reset(seed=3)
     env.reset()
@@ -65,17 +67,18 @@ def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_pat
     env = CalvinEnv(control_mode="abs", cameras=(), steps_per_command=200, results_dir=str(tmp_path))
     obs, info = env.reset(seed=chain)
     sentences, rewards = [env.task_description], []
-    for obs, reward, terminated, truncated, info in script(env, obs, tasks[:2]):
-        rewards.append(reward)
+    for result in script(env, obs, tasks[:2]):
+        rewards.append(result[1])
         sentences.append(env.task_description)
-        assert not truncated
+        assert not result[3]
+    obs, _, terminated, _, info = result
     assert sum(rewards) == 2
     assert info == {"is_success": False, "successes": 2}
     assert list(dict.fromkeys(sentences)) == [env._sentences[task][0] for task in tasks[:3]]
     steps = 0
     while not terminated:
         stay = np.concatenate([obs["agent_pos"][:6], [1]])
-        obs, reward, terminated, truncated, info = env.step(stay)
+        obs, reward, terminated, _, _ = env.step(stay)
         steps += 1
     assert steps == 200
     assert reward == 0

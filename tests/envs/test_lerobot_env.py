@@ -38,7 +38,7 @@ def rollout(use_async: bool):
     states, ends = [obs["agent_pos"]], []
     action = np.tile([1.0, 0, 0, 0, 0, 0, 1], (2, 1))
     for _ in range(7):
-        obs, rewards, terminated, _, info = vector.step(action)
+        obs, rewards, terminated, _, _info = vector.step(action)
         assert (rewards == 0).all()
         states.append(obs["agent_pos"])
         ends.append(terminated.copy())
