@@ -12,7 +12,7 @@ from .assets import Assets, open_assets
 from .cameras import CAMERAS, gripper_view, static_view, take_picture
 from .errors import DeskError, SimulationError
 from .furniture import Table, load_blocks
-from .oracle import BlockState, Snapshot, completed_tasks
+from .oracle import BlockState, Snapshot, Touch, completed_tasks
 from .robot import Robot
 from .scenes import COLORS, Scene, get_scene
 
@@ -149,14 +149,20 @@ class Desk:
     def snapshot(self) -> Snapshot:
         """What the task oracle needs of the present state."""
         self._require_open()
-        touched = p.getContactPoints(bodyA=self._robot.body, physicsClientId=self._client) or ()
+        contacts: dict[str, set[Touch]] = {name: set() for name in ("robot", *COLORS)}
+        for contact in p.getContactPoints(physicsClientId=self._client) or ():
+            a, b = (self._touch(contact[1 + i], contact[3 + i]) for i in (0, 1))
+            for this, other in ((a, b), (b, a)):
+                if this[0] in contacts:
+                    contacts[this[0]].add(other)
+        slide, drawer, _, _ = self._table.joints()
         return Snapshot(
-            slide=self._table.joint("slide"),
-            drawer=self._table.joint("drawer"),
+            slide=slide,
+            drawer=drawer,
             bulb=self._table.bulb,
             led=self._table.led,
-            blocks={color: self._block_state(color) for color in COLORS},
-            touched_by_robot=frozenset(self._names[contact[2]] for contact in touched),
+            blocks={color: self._block_state(color, frozenset(contacts[color])) for color in COLORS},
+            touched_by_robot=frozenset(body for body, _ in contacts["robot"]),
         )
 
     def completed_tasks(self, start: Snapshot) -> set[str]:
@@ -211,20 +217,18 @@ class Desk:
     def _scene_obs(self) -> np.ndarray:
         return np.concatenate([self._table.observe(), *(self._blocks[c].observe() for c in COLORS)])
 
-    def _block_state(self, color: str) -> BlockState:
+    def _block_state(self, color: str, contacts: frozenset[Touch]) -> BlockState:
         block = self._blocks[color]
-        contacts = p.getContactPoints(bodyA=block.body, physicsClientId=self._client) or ()
-        position, orientation = block.pose()
-        linear, angular = block.velocity()
+        (position, orientation), (linear, angular) = block.pose(), block.velocity()
         return BlockState(
             position=np.array(position),
             orientation=np.array(orientation),
             linear_velocity=np.array(linear),
             angular_velocity=np.array(angular),
-            contacts=frozenset(self._touch(contact[2], contact[4]) for contact in contacts),
+            contacts=contacts,
         )
 
-    def _touch(self, body: int, link: int) -> tuple[str, str]:
+    def _touch(self, body: int, link: int) -> Touch:
         name = self._names[body]
         return name, self._desk_links[link] if name == "desk" else ""
 

@@ -12,6 +12,8 @@ OFF = (1.0, 1.0, 1.0, 1.0)
 LED_ON = (0.0, 1.0, 0.0, 1.0)
 BULB_ON = (1.0, 1.0, 0.0, 1.0)
 JOINT_FORCE = 4.0
+JOINTS = ("slide", "drawer", "button", "switch")
+"""The desk's joints in the order of ``scene_obs``."""
 
 
 class Table:
@@ -48,24 +50,26 @@ class Table:
         self._shown = {"led": False, "bulb": False}
         self._was_pressed = self._was_on = False
 
-    def joint(self, name: str) -> float:
-        """Position (m) of ``slide``, ``drawer``, ``button`` or ``switch``."""
-        return p.getJointState(self.body, self._joints[name], physicsClientId=self.client)[0]
+    def joints(self) -> list[float]:
+        """Positions (m) of slide, drawer, button and switch."""
+        indices = [self._joints[name] for name in JOINTS]
+        return [state[0] for state in p.getJointStates(self.body, indices, physicsClientId=self.client)]
 
     def reset(self, state: np.ndarray) -> None:
         """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the head of ``scene_obs``."""
-        for name, value in zip(("slide", "drawer", "button", "switch"), state[:4], strict=True):
+        for name, value in zip(JOINTS, state[:4], strict=True):
             p.resetJointState(self.body, self._joints[name], value, physicsClientId=self.client)
         self.bulb, self.led = bool(state[4] > 0.5), bool(state[5] > 0.5)
         self._was_pressed = self._was_on = False
 
     def update_lights(self) -> None:
         """Called once per control step: a new press toggles the LED, a moved switch sets the bulb."""
-        pressed = self.joint("button") > BUTTON_TRAVEL / 2
+        _, _, button, switch = self.joints()
+        pressed = button > BUTTON_TRAVEL / 2
         if pressed and not self._was_pressed:
             self.led = not self.led
         self._was_pressed = pressed
-        on = self.joint("switch") > SWITCH_TRAVEL / 2
+        on = switch > SWITCH_TRAVEL / 2
         if on != self._was_on:
             self.bulb = on
         self._was_on = on
@@ -83,8 +87,7 @@ class Table:
 
     def observe(self) -> np.ndarray:
         """The first six numbers of ``scene_obs``: (6,) float64."""
-        joints = [self.joint(name) for name in ("slide", "drawer", "button", "switch")]
-        return np.array([*joints, float(self.bulb), float(self.led)])
+        return np.array([*self.joints(), float(self.bulb), float(self.led)])
 
 
 class Block:

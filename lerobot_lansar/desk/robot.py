@@ -137,7 +137,7 @@ class Robot:
     def observe(self) -> np.ndarray:
         """``robot_obs``: TCP xyz, TCP euler, opening width, seven arm joints, last gripper action; (15,) float64."""
         position, orientation = self.tcp_pose()
-        fingers = [p.getJointState(self.body, j, physicsClientId=self.client)[0] for j in FINGERS]
-        arm = [p.getJointState(self.body, j, physicsClientId=self.client)[0] for j in ARM]
+        states = p.getJointStates(self.body, ARM + FINGERS, physicsClientId=self.client)
+        *arm, left, right = (state[0] for state in states)
         euler = p.getEulerFromQuaternion(orientation)
-        return np.array([*position, *euler, fingers[0] + fingers[1], *arm, self.gripper_action])
+        return np.array([*position, *euler, left + right, *arm, self.gripper_action])

@@ -1,0 +1,143 @@
+"""The whole line as a user types it: record, convert, train, evaluate, report. Real commands, few steps."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BIN = Path(sys.executable).parent
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    return tmp_path_factory.mktemp("line")
+
+
+@pytest.fixture(scope="module")
+def run(work):
+    def run(command, *options, fails=False):
+        environment = {**os.environ, "HF_HOME": str(work / "hf"), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [BIN / command, *options], cwd=work, env=environment, capture_output=True, text=True, timeout=600
+        )
+        assert (done.returncode != 0) == fails, done.stdout[-3000:] + done.stderr[-3000:]
+        return done.stdout + done.stderr
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def dataset(run, work):
+    """Four demonstrations with pictures, converted with videos and CLIP embeddings."""
+    run("lansar-record", "--output_dir=desk", "--tasks=[turn_on_led,turn_off_led]", "--episodes=4")
+    run(
+        "lansar-convert", "--root=desk", "--split=training", "--repo_id=me/desk", "--output_dir=data",
+        "--embed=true", "--clip.model=lansar-tiny", "--clip.pretrained=",
+    )  # fmt: skip
+    return ["--dataset.repo_id=me/desk", f"--dataset.root={work / 'data'}"]
+
+
+SMALL_LANSAR = [
+    "--policy.hidden=32", "--policy.context_layers=1", "--policy.context_heads=2", "--policy.decoder_layers=1",
+    "--policy.decoder_heads=2", "--policy.feedforward=64", "--policy.clip.model=lansar-tiny",
+    "--policy.clip.pretrained=", "--policy.device=cpu", "--policy.push_to_hub=false",
+]  # fmt: skip
+TRAINING = ["--batch_size=4", "--num_workers=0", "--log_freq=1"]
+EVALUATION = ["--env.type=calvin", "--env.steps_per_command=5", "--policy.device=cpu"]
+
+
+@pytest.fixture(scope="module")
+def lansar(run, dataset):
+    """A LanSAR with pictures after two updates, trained by the short form of the command."""
+    options = [option.removeprefix("--") for option in (*dataset, *SMALL_LANSAR[:-2], *TRAINING)]
+    run(
+        "lerobot", "train", "policy=lansar", *options, "--policy.device=cpu", "--policy.push_to_hub=false",
+        "steps=2", "save_freq=2", "output_dir=out/lansar",
+    )  # fmt: skip
+    return "out/lansar/checkpoints/last/pretrained_model"
+
+
+def successes(work, folder):
+    info = json.loads((work / folder / "eval_info.json").read_text())
+    return [task["metrics"]["sum_rewards"] for task in info["per_task"]]
+
+
+def test_lansar_evaluates_the_same_with_any_batch_size(run, work, lansar):
+    for size in (1, 4):
+        run(
+            "lerobot-eval", f"--policy.path={lansar}", *EVALUATION, "--env.task=turn_on_led", "--eval.n_episodes=4",
+            "--env.control_mode=abs", "--env.steps_per_command=30", f"--eval.batch_size={size}", "--seed=0",
+            f"--env.results_dir=results{size}", f"--output_dir=eval{size}",
+        )  # fmt: skip
+    assert successes(work, "eval1") == successes(work, "eval4")
+    assert len(successes(work, "eval1")[0]) == 4
+    episodes = [
+        {
+            json.loads(line)["seed"]: json.loads(line)["commands"]
+            for f in (work / d).iterdir()
+            for line in f.open()
+        }
+        for d in ("results1", "results4")
+    ]
+    assert episodes[0] == episodes[1]
+    assert set(episodes[0]) == {0, 1, 2, 3}
+
+
+def test_a_chain_is_evaluated_and_reported(run, work, lansar):
+    run(
+        "lerobot-eval", f"--policy.path={lansar}", *EVALUATION, "--env.control_mode=abs", "--eval.n_episodes=1",
+        "--eval.batch_size=1", "--seed=0", "--output_dir=eval_chain", "--env.results_dir=eval_chain",
+    )  # fmt: skip
+    printed = run("lansar-report", "--eval_dir=eval_chain", f"--policy_path={lansar}")
+    assert "rotate_blue_block_right" in printed  # chain 0's first task
+    assert "built-in" in printed
+    report = json.loads((work / "eval_chain" / "report.json").read_text())
+    assert report["average_length"] == 0
+    assert list((work / "eval_chain").rglob("*.mp4"))
+
+
+def test_other_control_mode_stops_the_evaluation_with_advice(run, lansar):
+    printed = run(
+        "lerobot-eval", f"--policy.path={lansar}", *EVALUATION, "--env.control_mode=rel", "--eval.n_episodes=1",
+        "--eval.batch_size=1", "--output_dir=eval_mode", fails=True,
+    )  # fmt: skip
+    assert "--env.control_mode=abs" in printed
+
+
+def test_training_resumes_and_fine_tunes(run, work, dataset, lansar):
+    config = f"{lansar}/train_config.json"
+    run("lerobot-train", f"--config_path={config}", "--resume=true", "--steps=4")
+    assert (work / "out/lansar/checkpoints/000004/pretrained_model/model.safetensors").is_file()
+    run(
+        "lerobot-train", f"--policy.path={lansar}", "--policy.push_to_hub=false", *dataset, *TRAINING, "--steps=2",
+        "--output_dir=out/tuned",
+    )  # fmt: skip
+    assert (work / "out/tuned/checkpoints/last/pretrained_model/model.safetensors").is_file()
+
+
+def test_act_trains_on_the_dataset_and_runs_on_the_desk(run, work, dataset):
+    run(
+        "lerobot-train", "--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu", *dataset, *TRAINING,
+        "--policy.pretrained_backbone_weights=null", "--policy.dim_model=32", "--policy.n_heads=2",
+        "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1",
+        "--policy.chunk_size=4", "--policy.n_action_steps=4", "--steps=2", "--output_dir=out/act",
+    )  # fmt: skip
+    run(
+        "lerobot-eval", "--policy.path=out/act/checkpoints/last/pretrained_model", *EVALUATION,
+        "--env.task=turn_on_led", "--eval.n_episodes=2", "--eval.batch_size=2", "--output_dir=eval_act",
+    )  # fmt: skip
+    assert len(successes(work, "eval_act")[0]) == 2
+
+
+def test_unusable_requests_are_answered_clearly(run, dataset):
+    assert "'juggle' is unknown" in run(
+        "lerobot-eval", "--policy.type=act", "--policy.device=cpu", "--env.type=calvin", "--env.task=juggle",
+        "--output_dir=nowhere", fails=True,
+    )  # fmt: skip
+    printed = run("lansar-convert", "--root=elsewhere", "--repo_id=me/x", "--output_dir=x", fails=True)
+    assert "elsewhere" in printed
+    assert "Traceback" not in printed

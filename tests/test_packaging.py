@@ -1,0 +1,40 @@
+"""The distribution: LeRobot must find it, and importing it must stay cheap."""
+
+import subprocess
+import sys
+from importlib.metadata import entry_points, metadata
+
+
+def test_distribution_name_is_the_one_lerobot_looks_for():
+    # LeRobot compares the metadata's name literally and imports a module of that name: hyphens would hide the plugin.
+    assert metadata("lerobot_policy_lansar")["Name"] == "lerobot_policy_lansar"
+
+
+def test_every_command_is_installed():
+    commands = {entry.name for entry in entry_points(group="console_scripts") if entry.value.split(":")[0]}
+    assert {"lansar-record", "lansar-convert", "lansar-report", "lerobot"} <= commands
+
+
+def test_the_desk_needs_neither_lerobot_nor_torch():
+    code = "import sys, lerobot_lansar.desk; print([m for m in ('lerobot', 'torch') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("[]")
+
+
+def test_policy_and_desk_never_meet():
+    code = (
+        "import sys, lerobot_lansar.policy.modeling_lansar; "
+        "print('pybullet' in sys.modules, any(m.startswith('lerobot_lansar.desk') for m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("False False")
+
+
+def test_lerobots_own_discovery_registers_policy_and_environment():
+    code = (
+        "from lerobot.utils.import_utils import register_third_party_plugins as r; r(); "
+        "from lerobot.configs.policies import PreTrainedConfig as P; from lerobot.envs.configs import EnvConfig as E; "
+        "print('lansar' in P.get_known_choices(), 'calvin' in E.get_known_choices())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("True True")
