@@ -1,0 +1,173 @@
+"""CLIP through open_clip: pictures and commands in, embeddings out (Eq 3.2-3.4).
+
+Embeddings are CLIP's own outputs, not divided by their norm. Converting a dataset and running the policy go
+through this one class, so a stored and a freshly computed embedding of the same picture agree.
+"""
+
+import contextlib
+import functools
+import hashlib
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+CLIP_MODELS = Path(__file__).parent / "clip_models"
+"""Model configurations in open_clip's format that come with this package; trained weights belong here too."""
+
+
+@dataclass
+class ClipConfig:
+    """Which CLIP.
+
+    Attributes:
+        model: an open_clip model name ("ViT-B-32") or one that comes with this package ("lansar-tiny").
+        pretrained: an open_clip tag ("openai"), a local weights file, or "" for random weights from a fixed
+            seed.
+    """
+
+    model: str = "ViT-B-32"
+    pretrained: str = "openai"
+
+
+@functools.cache
+def _open_clip() -> Any:
+    """open_clip, knowing our models too. Imported late: it is slow, and not always needed."""
+    import open_clip
+
+    open_clip.add_model_config(CLIP_MODELS)
+    return open_clip
+
+
+@contextlib.contextmanager
+def _quiet_logging() -> Iterator[None]:
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def _model_config(model: str) -> dict[str, Any]:
+    config = _open_clip().get_model_config(model)
+    if config is None:
+        raise ValueError(
+            f"--policy.clip.model={model!r} is not known to open_clip. Examples: ViT-B-32, ViT-L-14, "
+            "lansar-tiny; "
+            'all names: python -c "import open_clip; print(open_clip.list_models())"'
+        )
+    return config
+
+
+def embedding_size(model: str) -> int:
+    """D of a model, without building it.
+
+    Raises:
+        ValueError: an unknown model name.
+    """
+    return int(_model_config(model)["embed_dim"])
+
+
+def weights_are_public(config: ClipConfig) -> bool:
+    """True for an open_clip tag: such weights can be fetched by name, no checkpoint need carry them."""
+    return bool(config.pretrained and _open_clip().get_pretrained_cfg(config.model, config.pretrained))
+
+
+class Clip:
+    """Both towers of one CLIP, frozen, in float32.
+
+    Args:
+        config: model and weights.
+        device: where the towers live and compute.
+        weights: a state dict to use instead of `config.pretrained` (from a checkpoint).
+
+    Attributes:
+        embed_dim: D.
+
+    Raises:
+        ValueError: an unknown model name, or a `pretrained` that is neither a tag nor an existing file.
+    """
+
+    def __init__(
+        self, config: ClipConfig, device: str | torch.device = "cpu", weights: dict[str, Tensor] | None = None
+    ) -> None:
+        open_clip = _open_clip()
+        self.config = config
+        self.embed_dim = embedding_size(config.model)
+        tag = open_clip.get_pretrained_cfg(config.model, config.pretrained) if config.pretrained else {}
+        if weights is None and config.pretrained and not tag and not Path(config.pretrained).is_file():
+            tags = ", ".join(open_clip.list_pretrained_tags_by_model(config.model)) or "it has none"
+            raise ValueError(
+                f"--policy.clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of "
+                f"{config.model} ({tags})."
+            )
+        # Without weights of its own choice open_clip warns of a random model; here that is meant, or about to
+        # be replaced by a checkpoint's weights.
+        with torch.random.fork_rng(devices=[]), _quiet_logging():
+            torch.manual_seed(
+                0
+            )  # random weights are the same every time, and the caller's seed is left alone
+            model = open_clip.create_model(
+                config.model,
+                pretrained=config.pretrained if weights is None and config.pretrained else None,
+                # Some tags (ViT-B-32/openai) were trained with another activation than their model's file
+                # says; open_clip only warns, and the embeddings would be wrong.
+                force_quick_gelu=bool(tag.get("quick_gelu", False)),
+            )
+        if weights is not None:
+            model.load_state_dict(weights)
+        self.model: Any = model.eval().requires_grad_(False).to(device)
+        self.device = torch.device(device)
+        self.tokenizer = open_clip.get_tokenizer(config.model)
+        preprocess = open_clip.get_model_preprocess_cfg(model)
+        size = preprocess["size"]
+        self.image_size: tuple[int, int] = (size, size) if isinstance(size, int) else tuple(size)
+        self._mean = torch.tensor(preprocess["mean"], device=device).view(3, 1, 1)
+        self._std = torch.tensor(preprocess["std"], device=device).view(3, 1, 1)
+
+    @functools.cached_property
+    def weights_sha256(self) -> str:
+        """SHA-256 over names and values of all weights: tells which CLIP made an embedding."""
+        digest = hashlib.sha256()
+        for name, value in sorted(self.model.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(value.cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    @torch.no_grad()
+    def encode_images(self, images: Tensor | np.ndarray) -> Tensor:
+        """Pictures to embeddings.
+
+        Args:
+            images: uint8 (B, H, W, 3), or float (B, 3, H, W) in [0, 1].
+
+        Returns:
+            (B, D) float32 on this CLIP's device.
+
+        Raises:
+            ValueError: another shape or dtype.
+        """
+        x = torch.as_tensor(images)
+        if x.dtype == torch.uint8 and x.ndim == 4 and x.shape[-1] == 3:
+            x = x.to(self.device).permute(0, 3, 1, 2).float() / 255
+        elif not (x.is_floating_point() and x.ndim == 4 and x.shape[1] == 3):
+            raise ValueError(
+                f"images must be uint8 (B, H, W, 3) or float (B, 3, H, W) in [0, 1], "
+                f"got {x.dtype} {tuple(x.shape)}."
+            )
+        x = x.to(self.device, torch.float32)
+        # CALVIN's pictures are square, so a plain resize is open_clip's resize and centre crop.
+        x = F.interpolate(x, self.image_size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
+        return self.model.encode_image((x - self._mean) / self._std)
+
+    @torch.no_grad()
+    def encode_texts(self, texts: list[str]) -> Tensor:
+        """Commands to embeddings, (B, D) float32 on this CLIP's device."""
+        return self.model.encode_text(self.tokenizer(texts).to(self.device))

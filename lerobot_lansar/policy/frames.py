@@ -1,0 +1,195 @@
+"""All frames of one LeRobotDataset as memory-mapped arrays, ordered by LeRobot's absolute `index`.
+
+Why: reading a window of 64 steps through LeRobot's delta timestamps costs 150 ms and more, from these arrays
+0.05 ms. They are made from the dataset's parquet files at first use, kept in `<root>/.lansar_frames`, and
+made again when the dataset changed (`dataset_fingerprint`). CLIP embeddings of the pictures are not made
+here: `lansar-convert` puts them into `<root>/clip` (see `clip_dir`).
+"""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+from tqdm import tqdm
+
+CACHE = ".lansar_frames"
+COLUMNS = {"state": ("observation.state", 15), "environment_state": ("observation.environment_state", 24)}
+COLUMNS["action"] = ("action", 7)
+CAMERAS = {"static": "observation.images.static", "gripper": "observation.images.gripper"}
+
+
+def clip_dir(root: Path) -> Path:
+    """Where a dataset keeps its CLIP embeddings.
+
+    It holds `observation.images.static.npy` and `observation.images.gripper.npy`, (total_frames, D) float16
+    each in the order of `index`, and `clip.json` {model, pretrained, weights_sha256, embed_dim, frames,
+    fingerprint}.
+    """
+    return Path(root) / "clip"
+
+
+def data_files(root: Path) -> list[Path]:
+    """The dataset's frame tables, in order.
+
+    Raises:
+        FileNotFoundError: there are none.
+    """
+    files = sorted((Path(root) / "data").rglob("*.parquet"))
+    if not files:
+        raise FileNotFoundError(
+            f"{Path(root) / 'data'} has no parquet files: not a complete LeRobotDataset v3."
+        )
+    return files
+
+
+def dataset_fingerprint(root: Path) -> str:
+    """Identifies the contents of a dataset's frame tables, the same wherever the dataset lies.
+
+    Of each parquet file it reads name, size and the last 64 KiB: that is where parquet keeps row counts, the
+    sizes of all column chunks and their smallest and largest values, so rewritten frames show, at once.
+
+    Args:
+        root: the LeRobotDataset's folder.
+
+    Returns:
+        64 hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    for path in data_files(root):
+        size = path.stat().st_size
+        digest.update(f"{path.relative_to(root).as_posix()} {size}\n".encode())
+        with path.open("rb") as file:
+            file.seek(max(0, size - 65536))
+            digest.update(file.read())
+    return digest.hexdigest()
+
+
+def read_frames(root: Path) -> dict[str, np.ndarray]:
+    """Every frame's numbers from the parquet files, sorted by `index`.
+
+    Returns:
+        index (T,) int64; state (T, 15), environment_state (T, 24), action (T, 7) float32; first and end (T,)
+        int64: the rows where the frame's episode begins and ends (end exclusive).
+
+    Raises:
+        ValueError: a missing column, a wrong width, NaN or infinity, an index that occurs twice.
+    """
+    parts: dict[str, list[np.ndarray]] = {}
+    files = data_files(root)
+    for path in tqdm(files, desc="Reading frames", disable=len(files) < 20):
+        present = pq.read_schema(path).names
+        wanted = ["index", "episode_index", *(column for column, _ in COLUMNS.values())]
+        missing = [name for name in wanted if name not in present]
+        if missing:
+            raise ValueError(
+                f"{path} has no column {', '.join(missing)}; LanSAR trains on observation.state, "
+                "observation.environment_state and action as lansar-convert writes them."
+            )
+        table = pq.read_table(path, columns=wanted)
+        for name in ("index", "episode_index"):
+            parts.setdefault(name, []).append(table[name].to_numpy())
+        for name, (column, width) in COLUMNS.items():
+            values = np.concatenate([chunk.flatten().to_numpy() for chunk in table[column].chunks])
+            if len(values) != width * len(table):
+                raise ValueError(f"{path}: {column} must hold {width} numbers per frame.")
+            values = values.reshape(-1, width).astype(np.float32)
+            if not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+                raise ValueError(
+                    f"{path}: {column} is NaN or infinite in episode {parts['episode_index'][-1][row]} "
+                    f"(index {parts['index'][-1][row]}). Remove the episode or convert the dataset again."
+                )
+            parts.setdefault(name, []).append(values)
+    frames = {name: np.concatenate(values) for name, values in parts.items()}
+    order = np.argsort(frames["index"], kind="stable")
+    frames = {name: values[order] for name, values in frames.items()}
+    if (np.diff(frames["index"]) < 1).any():
+        raise ValueError(f"{Path(root) / 'data'} holds a frame index twice: files left over from before?")
+    episode = frames.pop("episode_index")
+    starts = np.flatnonzero(np.diff(episode, prepend=episode[0] - 1))
+    ends = np.append(starts[1:], len(episode))
+    frames["first"] = np.repeat(starts, ends - starts)
+    frames["end"] = np.repeat(ends, ends - starts)
+    return frames
+
+
+def load_frames(root: Path) -> dict[str, np.ndarray]:
+    """`read_frames` through the cache in `<root>/.lansar_frames`; memory-mapped, read-only.
+
+    A half-written cache is never seen: it is written beside and renamed. In a folder that cannot be written
+    to the arrays are kept in memory, and read again next time.
+    """
+    root = Path(root)
+    cache = root / CACHE
+    fingerprint = dataset_fingerprint(root)
+    if not _is_current(cache, fingerprint):
+        frames = read_frames(root)
+        try:
+            scratch = root / f"{CACHE}-{uuid.uuid4().hex}"
+            scratch.mkdir()
+        except OSError as error:
+            logging.warning(f"Cannot keep LanSAR's frame arrays in {cache} ({error.strerror}).")
+            return frames
+        try:
+            for name, values in frames.items():
+                np.save(scratch / f"{name}.npy", values)
+            (scratch / "fingerprint").write_text(fingerprint)
+            if not _is_current(cache, fingerprint):  # another process may have been faster
+                shutil.rmtree(cache, ignore_errors=True)
+                os.replace(scratch, cache)
+        except OSError:
+            if not _is_current(cache, fingerprint):
+                raise
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+    names = ("index", *COLUMNS, "first", "end")
+    return {name: np.load(cache / f"{name}.npy", mmap_mode="r") for name in names}
+
+
+def _is_current(cache: Path, fingerprint: str) -> bool:
+    try:
+        return (cache / "fingerprint").read_text() == fingerprint
+    except OSError:
+        return False
+
+
+def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray], dict]:
+    """The dataset's CLIP embeddings.
+
+    Args:
+        root: the LeRobotDataset's folder.
+        total_frames: frames in the whole dataset.
+
+    Returns:
+        {"static": (total_frames, D) float16, "gripper": ...} memory-mapped, by absolute index; the contents
+        of clip.json.
+
+    Raises:
+        FileNotFoundError: the dataset has none.
+        ValueError: they belong to other frames than the dataset's.
+    """
+    folder = clip_dir(root)
+    needed = ["clip.json", *(f"{key}.npy" for key in CAMERAS.values())]
+    missing = [name for name in needed if not (folder / name).is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{folder} lacks {', '.join(missing)}: the dataset has no CLIP embeddings of its pictures. "
+            "Convert it with `lansar-convert --embed=true`, or train without: --policy.use_images=false."
+        )
+    info = json.loads((folder / "clip.json").read_text())
+    arrays = {name: np.load(folder / f"{key}.npy", mmap_mode="r") for name, key in CAMERAS.items()}
+    shape = (total_frames, info["embed_dim"])
+    shapes = {array.shape for array in arrays.values()}
+    if shapes != {shape} or info["fingerprint"] != dataset_fingerprint(root):
+        raise ValueError(
+            f"The CLIP embeddings in {folder} were made for other frames than the dataset now has "
+            f"(arrays {shapes}, expected {shape}, or another fingerprint). "
+            "Delete that folder and convert again with `lansar-convert --embed=true`."
+        )
+    return arrays, info

@@ -1,0 +1,216 @@
+"""LanSAR for LeRobot: the loss in training; at inference one action per step, a history per environment."""
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from .configuration_lansar import LanSARConfig
+from .network import LanSARNetwork
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE
+from .scaling import SCENE_DIM, STATE_DIM, Scaler, wrap
+from .windows import ORIENTATION_UNIT, POSITION_UNIT, Windows, set_current
+
+CONTROL_MODES = {0: "rel", 1: "abs"}  # the env's observation.control_mode
+
+
+@dataclass
+class History:
+    """What one environment's episode has been since its history was last cleared.
+
+    Attributes:
+        command: the sentence being carried out.
+        steps: control steps since then; the window below may be shorter.
+        contexts: E of the last steps, (length, h); each is computed once and kept.
+        states: X_target of the last steps, (length, h).
+    """
+
+    command: str
+    steps: int
+    contexts: Tensor
+    states: Tensor
+
+
+class LanSARPolicy(PreTrainedPolicy):
+    """Language-commanded Scene-aware Action Response.
+
+    Args:
+        config: all options.
+        dataset_stats: ignored, LanSAR scales with statistics of its own.
+        dataset_meta: given in training only. The policy then computes its scaling statistics from all the
+            dataset's frames (a checkpoint's own replace them afterwards) and makes the training windows
+            available to its preprocessor.
+
+    Raises:
+        ValueError, FileNotFoundError: the dataset lacks something; the message says what.
+    """
+
+    config_class = LanSARConfig
+    name = "lansar"
+    config: LanSARConfig
+
+    def __init__(
+        self, config: LanSARConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any
+    ) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.scaler = Scaler(config.orientation)
+        self.network = LanSARNetwork(config.network)
+        if dataset_meta is not None:
+            if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
+                logging.warning(
+                    "LanSAR does not read this dataset's videos, but LeRobot decodes them for every sample: "
+                    "train on a copy without them (lansar-convert --videos=false)."
+                )
+            windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
+            self.scaler.fit(
+                torch.tensor(windows.frames["state"]),
+                torch.tensor(windows.frames["environment_state"]),
+                torch.tensor(windows.targets[windows.has_target, :6]),
+            )
+            set_current(windows)
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        return self.parameters()
+
+    def reset(self) -> None:
+        """Forget every environment's history; LeRobot calls this when a batch of episodes begins."""
+        self._histories: list[History] = []
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+        """Loss of a batch of windows, averaged over their valid steps (Eq 4.3-4.6).
+
+        Args:
+            batch: what the preprocessor makes of sampled frames, see `processor_lansar.py`.
+
+        Returns:
+            The scalar loss, and its parts.
+        """
+        if "action_is_pad" not in batch or CLIP_COMMAND not in batch:
+            raise ValueError("LanSAR's forward needs windows: pass the batch through its preprocessor first.")
+        valid = ~batch["action_is_pad"]
+        state, blocks, scene = self.scaler.encode(batch[OBS_STATE], batch[OBS_ENV_STATE])
+        static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
+        motion, logit = self.network(batch[CLIP_COMMAND], state, blocks, scene, valid, static, gripper)
+        goal = batch[ACTION][valid]  # (N, 7)
+        delta = self.scaler.scale_delta(goal[:, :6])
+        beta = self.config.smooth_l1_beta
+        position = F.smooth_l1_loss(motion[:, :3], delta[:, :3], beta=beta)
+        orientation = F.smooth_l1_loss(motion[:, 3:], delta[:, 3:], beta=beta)
+        open_close = F.binary_cross_entropy_with_logits(logit, goal[:, 6])
+        loss = position + orientation + open_close
+        parts = {"position_loss": position, "orientation_loss": orientation, "gripper_loss": open_close}
+        return loss, {name: value.item() for name, value in parts.items()}
+
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        raise NotImplementedError("LanSAR decides one action at a time: use select_action.")
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """One action per environment.
+
+        Args:
+            batch: a preprocessed env observation: observation.state (B, 15), observation.environment_state
+                (B, 24), observation.clip.* (B, D), task: B sentences, and, if the env says so,
+                observation.control_mode (B, 1).
+
+        Returns:
+            (B, 7) float32. "abs": TCP target xyz (m), euler xyz (rad), gripper -1/+1. "rel": differences in
+            units of (0.02 m, 0.05 rad) clipped to +-1, gripper -1/+1.
+
+        Raises:
+            ValueError: wrong shapes, NaN, or an env in the other control mode.
+        """
+        self.eval()
+        state, environment_state = batch[OBS_STATE].float(), batch[OBS_ENV_STATE].float()
+        self._check(batch, state, environment_state)
+        inputs = [state, environment_state, batch[CLIP_COMMAND]]
+        inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
+        histories = self._recall(batch["task"])
+        # On a CPU one environment at a time: batching gains little there, and the size of a matrix product
+        # changes its last bits. So results are exactly the same for every batch size; on a GPU they are up to
+        # rounding.
+        size = 1 if state.device.type == "cpu" else len(state)
+        chunks = [
+            self._act(histories[i : i + size], *(x[i : i + size] for x in inputs))
+            for i in range(0, len(state), size)
+        ]
+        return torch.cat(chunks)
+
+    def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor) -> None:
+        sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, SCENE_DIM + 18))
+        for name, value, size in sizes:
+            if value.ndim != 2 or value.shape[1] != size:
+                raise ValueError(f"{name} must be (B, {size}), got {tuple(value.shape)}.")
+            if not value.isfinite().all():
+                rows = (~value.isfinite().all(dim=1)).nonzero().flatten().tolist()
+                raise ValueError(f"{name} is NaN or infinite in environment {rows} of the batch.")
+        if len(batch.get("task") or ()) != len(state):
+            raise ValueError("LanSAR needs one command per environment in `task`.")
+        mode = batch.get("observation.control_mode")
+        if mode is not None:
+            for value in mode.flatten().tolist():
+                env, mine = CONTROL_MODES.get(int(value), str(value)), self.config.control_mode
+                if env != mine:
+                    raise ValueError(
+                        f"The environment takes {env} actions (--env.control_mode={env}), this policy "
+                        f"returns {mine} ones (--policy.control_mode={mine}). "
+                        f"Set --env.control_mode={mine} or --policy.control_mode={env}."
+                    )
+
+    def _recall(self, tasks: list[str]) -> list[History]:
+        """Each environment's history, empty where its command changed or the time to forget has come."""
+        if len(self._histories) != len(tasks):
+            self._histories = [self._blank("") for _ in tasks]
+        for i, (history, command) in enumerate(zip(self._histories, tasks, strict=True)):
+            if history.command != command or history.steps >= self.config.history_clear_steps:
+                self._histories[i] = self._blank(command)
+        return self._histories
+
+    def _blank(self, command: str) -> History:
+        empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
+        return History(command, 0, empty, empty)
+
+    def _act(
+        self,
+        histories: list[History],
+        state: Tensor,
+        environment_state: Tensor,
+        command: Tensor,
+        static: Tensor | None = None,
+        gripper: Tensor | None = None,
+    ) -> Tensor:
+        """Take one step into the histories and decide: (b, 15), (b, 24), (b, D)... -> (b, 7)."""
+        config, network = self.config, self.network
+        x, blocks, scene = self.scaler.encode(state, environment_state)
+        commands = network.encode_command(command)
+        contexts = network.encode_context(x, blocks, scene, static, gripper, commands[0])  # (b, h)
+        states = network.state_target(x)
+        for i, history in enumerate(histories):
+            history.steps += 1
+            history.contexts = torch.cat([history.contexts, contexts[i : i + 1]])[-config.window :]
+            history.states = torch.cat([history.states, states[i : i + 1]])[-config.window :]
+        length = torch.tensor([len(history.contexts) for history in histories], device=state.device)
+        decoded = network.decode(
+            pad_sequence([history.contexts for history in histories], batch_first=True),
+            pad_sequence([history.states for history in histories], batch_first=True),
+            commands,
+        )
+        last = decoded[torch.arange(len(histories), device=state.device), length - 1]  # (b, h)
+        motion, logit = network.predict(last)
+        delta = self.scaler.unscale_delta(motion)
+        scale = config.position_scale_start - config.position_scale_slope * length / config.window  # Eq 4.8
+        position = delta[:, :3] * scale[:, None]
+        orientation = delta[:, 3:] * delta.new_tensor([1.0, 1.0, config.yaw_scale])
+        grip = torch.where(logit > 0, 1.0, -1.0)[:, None]
+        if config.control_mode == "abs":
+            return torch.cat([state[:, :3] + position, wrap(state[:, 3:6] + orientation), grip], dim=1)
+        relative = torch.cat([position / POSITION_UNIT, orientation / ORIENTATION_UNIT], dim=1)
+        return torch.cat([relative.clamp(-1, 1), grip], dim=1)

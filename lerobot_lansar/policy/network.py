@@ -1,0 +1,337 @@
+"""The LanSAR network: tensors in, tensors out. Nothing here knows LeRobot, CLIP's weights or the simulator.
+
+Letters used in the shape comments:
+
+    B  windows in the batch                     N  valid (not padded) steps of all windows together
+    n  steps of the longest window              k  tokens of one timestep, CLS included
+    h  hidden size                              D  size of a CLIP embedding
+
+One timestep becomes ONE vector E_t, the context encoder's output at CLS:
+
+    CLS  X  B_red  B_blue  B_pink  S  I  G  (C)      every token sees every other (one timestep at a time)
+
+A window of timesteps becomes two sequences with the command C in front of every step (Eq 3.17, 3.18):
+
+    memory  M = C  E_0  C  E_1  C  E_2 ...           target position i sees target and memory positions <= i:
+    target  T = C  X_0  C  X_1  C  X_2 ...
+                                                          C X0  C X1
+    and the decoder's outputs at the X positions           1  .  .  .   C
+    go to the motion head and the gripper head.            1  1  .  .   X_0
+                                                           1  1  1  .   C
+                                                           1  1  1  1   X_1
+
+Windows are padded at their END only. The causal mask therefore already hides padding from every valid step:
+no separate padding mask is needed, and no padded step ever enters an MLP (it would poison BatchNorm's
+statistics).
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+@dataclass
+class NetworkConfig:
+    """Sizes and choices of the network; the defaults are Table 4.2 (6 decoder heads do not divide 512: 8).
+
+    Attributes:
+        state_dim: numbers in the encoded robot state X.
+        block_dim: numbers per encoded block B.
+        scene_dim: numbers in the scene state S.
+        clip_dim: D, size of the CLIP embeddings of command and images.
+        mlp_norm: normalisation inside the MLPs, "batch" (thesis) or "layer".
+        use_images: tokens I and G take part in the context.
+        use_spatial_context: tokens X, B (x3) and S take part in the context (the decoder's target keeps X
+            anyway).
+        command_in_context: the command is one more context token (section 6.5.1).
+        command_prepended: C stands once at the front of memory and target instead of before every step (Table
+            5.3).
+    """
+
+    state_dim: int = 15
+    block_dim: int = 6
+    scene_dim: int = 6
+    clip_dim: int = 512
+    hidden: int = 512
+    context_layers: int = 6
+    context_heads: int = 16
+    decoder_layers: int = 6
+    decoder_heads: int = 8
+    feedforward: int = 2048
+    dropout: float = 0.1
+    window: int = 64
+    mlp_norm: str = "batch"
+    use_images: bool = True
+    use_spatial_context: bool = True
+    command_in_context: bool = False
+    command_prepended: bool = False
+
+
+class BatchNorm(nn.BatchNorm1d):
+    """BatchNorm1d that uses its running statistics for a single row, which has no variance of its own.
+
+    One window means one command row, and a training run's last batch of an epoch can be one window.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.training and x.shape[0] == 1:
+            return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+        return super().forward(x)
+
+
+def make_norm(kind: str, features: int) -> nn.Module:
+    return BatchNorm(features) if kind == "batch" else nn.LayerNorm(features)
+
+
+def input_mlp(inputs: int, hidden: int, norm: str, dropout: float) -> nn.Sequential:
+    """One modality to the hidden size: rows (N, inputs) -> (N, hidden)."""
+    sizes = [inputs, hidden // 3, 2 * hidden // 3, hidden]
+    layers: list[nn.Module] = []
+    for i in range(3):
+        layers += [nn.Linear(sizes[i], sizes[i + 1]), make_norm(norm, sizes[i + 1]), nn.LeakyReLU()]
+        if i < 2:
+            layers.append(nn.Dropout(dropout))
+    return nn.Sequential(*layers)
+
+
+def head_mlp(hidden: int, outputs: int, norm: str, dropout: float) -> nn.Sequential:
+    """Decoder output to a prediction: rows (N, hidden) -> (N, outputs)."""
+    first = max(hidden - 256, 64)
+    second = max(first - 256, 64)
+    layers: list[nn.Module] = []
+    for a, b in ((hidden, first), (first, second)):
+        layers += [nn.Linear(a, b), make_norm(norm, b), nn.Dropout(dropout), nn.LeakyReLU()]
+    return nn.Sequential(*layers, nn.Linear(second, outputs))
+
+
+class Attention(nn.Module):
+    """Multi-head attention (Eq 2.4-2.8). Keys and values come from `memory`, queries from `x`."""
+
+    def __init__(self, hidden: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.heads, self.dropout = heads, dropout
+        self.query = nn.Linear(hidden, hidden)
+        self.key = nn.Linear(hidden, hidden)
+        self.value = nn.Linear(hidden, hidden)
+        self.out = nn.Linear(hidden, hidden)
+
+    def forward(self, x: Tensor, memory: Tensor, causal: bool = False) -> Tensor:
+        # (B, t, h) -> (B, heads, t, h/heads)
+        q = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        k = self.key(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        v = self.value(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        p = self.dropout if self.training else 0.0
+        y = F.scaled_dot_product_attention(q, k, v, dropout_p=p, is_causal=causal)
+        return self.out(y.transpose(1, 2).flatten(2))
+
+
+class FeedForward(nn.Sequential):
+    def __init__(self, hidden: int, feedforward: int, dropout: float) -> None:
+        super().__init__(
+            nn.Linear(hidden, feedforward), nn.ReLU(), nn.Dropout(dropout), nn.Linear(feedforward, hidden)
+        )
+
+
+class EncoderLayer(nn.Module):
+    """Post-norm encoder layer, the computation of torch.nn.TransformerEncoderLayer (Eq 2.9, 2.10)."""
+
+    def __init__(self, hidden: int, heads: int, feedforward: int, dropout: float) -> None:
+        super().__init__()
+        self.attention = Attention(hidden, heads, dropout)
+        self.feedforward = FeedForward(hidden, feedforward, dropout)
+        self.norm1, self.norm2 = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, queries: int | None = None) -> Tensor:
+        """x (N, k, h) -> (N, queries, h): only the first `queries` tokens are updated and returned."""
+        q = x[:, :queries]
+        q = self.norm1(q + self.dropout(self.attention(q, x)))
+        return self.norm2(q + self.dropout(self.feedforward(q)))
+
+
+class DecoderLayer(nn.Module):
+    """Post-norm decoder layer, the computation of torch.nn.TransformerDecoderLayer (Eq 2.14-2.26), causal."""
+
+    def __init__(self, hidden: int, heads: int, feedforward: int, dropout: float) -> None:
+        super().__init__()
+        self.self_attention = Attention(hidden, heads, dropout)
+        self.cross_attention = Attention(hidden, heads, dropout)
+        self.feedforward = FeedForward(hidden, feedforward, dropout)
+        self.norm1, self.norm2, self.norm3 = nn.LayerNorm(hidden), nn.LayerNorm(hidden), nn.LayerNorm(hidden)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, memory: Tensor) -> Tensor:
+        x = self.norm1(x + self.dropout(self.self_attention(x, x, causal=True)))
+        x = self.norm2(x + self.dropout(self.cross_attention(x, memory, causal=True)))
+        return self.norm3(x + self.dropout(self.feedforward(x)))
+
+
+class LanSARNetwork(nn.Module):
+    """Command, robot state, scene and pictures of a window in; motion and gripper of every step out."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        h, norm, p = c.hidden, c.mlp_norm, c.dropout
+
+        # Eq 3.5-3.12: one MLP per modality; the three blocks share one, their position tells them apart.
+        self.command_memory = input_mlp(c.clip_dim, h, norm, p)
+        self.command_target = input_mlp(c.clip_dim, h, norm, p)
+        self.state_target = input_mlp(c.state_dim, h, norm, p)
+        if c.use_spatial_context:
+            self.state_context = input_mlp(c.state_dim, h, norm, p)
+            self.block_context = input_mlp(c.block_dim, h, norm, p)
+            self.scene_context = input_mlp(c.scene_dim, h, norm, p)
+        if c.use_images:
+            self.static_context = input_mlp(c.clip_dim, h, norm, p)
+            self.gripper_context = input_mlp(c.clip_dim, h, norm, p)
+
+        # Eq 3.13-3.16. CLS is an embedding of one row, so that it is initialised like the positions.
+        self.context_tokens = ["CLS"]
+        self.context_tokens += ["X", "B_red", "B_blue", "B_pink", "S"] if c.use_spatial_context else []
+        self.context_tokens += ["I", "G"] if c.use_images else []
+        self.context_tokens += ["C"] if c.command_in_context else []
+        self.cls = nn.Embedding(1, h)
+        self.context_position = nn.Embedding(len(self.context_tokens), h)
+        self.context_layers = nn.ModuleList(
+            EncoderLayer(h, c.context_heads, c.feedforward, p) for _ in range(c.context_layers)
+        )
+
+        # Eq 3.17-3.23
+        length = 1 + c.window if c.command_prepended else 2 * c.window
+        self.memory_position = nn.Embedding(length, h)
+        self.target_position = nn.Embedding(length, h)
+        self.decoder_layers = nn.ModuleList(
+            DecoderLayer(h, c.decoder_heads, c.feedforward, p) for _ in range(c.decoder_layers)
+        )
+
+        # Eq 3.25, 3.26
+        self.motion_head = head_mlp(h, 6, norm, p)
+        self.gripper_head = head_mlp(h, 1, norm, p)
+        self.apply(self._initialise)
+
+    @staticmethod
+    def _initialise(module: nn.Module) -> None:
+        """Xavier-uniform weights for linear layers and embeddings, zero biases (Eq 4.1, 4.2)."""
+        if isinstance(module, nn.Linear | nn.Embedding):
+            nn.init.xavier_uniform_(module.weight)
+        if isinstance(module, nn.Linear):
+            nn.init.zeros_(module.bias)
+
+    def encode_command(self, command: Tensor) -> tuple[Tensor, Tensor]:
+        """CLIP text embeddings (B, D) -> C for the memory (and the context) and C for the target, (B, h)
+        each."""
+        return self.command_memory(command), self.command_target(command)
+
+    def encode_context(
+        self,
+        state: Tensor,
+        blocks: Tensor,
+        scene: Tensor,
+        static: Tensor | None = None,
+        gripper: Tensor | None = None,
+        command: Tensor | None = None,
+    ) -> Tensor:
+        """E_t of N timesteps, each on its own (Eq 3.13-3.16).
+
+        Args:
+            state: (N, state_dim) encoded and scaled robot state.
+            blocks: (N, 3, block_dim), red, blue, pink.
+            scene: (N, scene_dim).
+            static, gripper: (N, D) CLIP embeddings of the two pictures; read only with `use_images`.
+            command: (N, h) C of each timestep's window; read only with `command_in_context`.
+
+        Returns:
+            (N, h)
+        """
+        c = self.config
+        tokens = [self.cls.weight.expand(state.shape[0], 1, -1)]
+        if c.use_spatial_context:
+            blocks = self.block_context(blocks.flatten(0, 1)).unflatten(0, (-1, 3))
+            tokens += [self.state_context(state)[:, None], blocks, self.scene_context(scene)[:, None]]
+        if c.use_images:
+            assert static is not None
+            assert gripper is not None
+            tokens += [self.static_context(static)[:, None], self.gripper_context(gripper)[:, None]]
+        if c.command_in_context:
+            assert command is not None
+            tokens.append(command[:, None])
+        x = torch.cat(tokens, dim=1) + self.context_position.weight  # (N, k, h)
+        for i, layer in enumerate(self.context_layers):
+            # Only CLS is read at the end, so the last layer need not update the other tokens.
+            x = layer(x, queries=1 if i == len(self.context_layers) - 1 else None)
+        return x[:, 0]
+
+    def decode(self, contexts: Tensor, states: Tensor, command: tuple[Tensor, Tensor]) -> Tensor:
+        """What the decoder says at every X_t (Eq 3.17-3.24).
+
+        Args:
+            contexts: E, (B, n, h); steps past a window's end may hold anything finite.
+            states: X_target, (B, n, h); likewise.
+            command: C for memory and target, (B, h) each, from `encode_command`.
+
+        Returns:
+            (B, n, h)
+        """
+        memory = self._with_command(contexts, command[0])
+        target = self._with_command(states, command[1])
+        length = target.shape[1]
+        memory = memory + self.memory_position.weight[:length]
+        target = target + self.target_position.weight[:length]
+        for layer in self.decoder_layers:
+            target = layer(target, memory)
+        return target[:, 1:] if self.config.command_prepended else target[:, 1::2]
+
+    def _with_command(self, steps: Tensor, command: Tensor) -> Tensor:
+        """(B, n, h) and (B, h) -> C s C s C s ... (B, 2n, h), or prepended C s s s ... (B, 1 + n, h)."""
+        if self.config.command_prepended:
+            return torch.cat([command[:, None], steps], dim=1)
+        return torch.stack([command[:, None].expand_as(steps), steps], dim=2).flatten(1, 2)
+
+    def predict(self, decoded: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, h) -> scaled motion (N, 6): position then orientation, and gripper logits (N,): > 0 is open."""
+        return self.motion_head(decoded), self.gripper_head(decoded)[:, 0]
+
+    def forward(
+        self,
+        command: Tensor,
+        state: Tensor,
+        blocks: Tensor,
+        scene: Tensor,
+        valid: Tensor,
+        static: Tensor | None = None,
+        gripper: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Predictions for every valid step of a batch of windows.
+
+        Args:
+            command: (B, D) CLIP text embeddings.
+            state: (B, n, state_dim); blocks: (B, n, 3, block_dim); scene: (B, n, scene_dim), all scaled.
+            valid: (B, n) bool, True for real steps; each row is True up to its length, then False.
+            static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
+
+        Returns:
+            Motion (N, 6) and gripper logits (N,), rows in the order of `tensor[valid]`.
+        """
+        command_memory, command_target = self.encode_command(command)
+        window = valid.nonzero()[:, 0]  # (N,) which window each valid step belongs to
+        context = self.encode_context(
+            state[valid],
+            blocks[valid],
+            scene[valid],
+            static[valid] if static is not None else None,
+            gripper[valid] if gripper is not None else None,
+            command_memory[window],
+        )
+        contexts = scatter_steps(context, valid)
+        states = scatter_steps(self.state_target(state[valid]), valid)
+        return self.predict(self.decode(contexts, states, (command_memory, command_target))[valid])
+
+
+def scatter_steps(rows: Tensor, valid: Tensor) -> Tensor:
+    """Rows of valid steps (N, h) back to their places (B, n, h), zeros where padded."""
+    out = rows.new_zeros(*valid.shape, rows.shape[-1])
+    out[valid] = rows
+    return out

@@ -1,0 +1,196 @@
+"""Training windows: which steps of which demonstration the network sees for a sampled frame, and what it
+should predict.
+
+LeRobot samples every frame of every episode once per epoch, in random order. Here a sampled frame stands for
+a window of at most n = `window` steps, chosen by a fixed rule, so that a run can be resumed and a validation
+loss compared:
+
+* "episode": the demonstration from its start (thesis). Of a demonstration longer than n, frame j stands for
+  the window that starts at j * (L - n) / (L - 1): every start equally often, the first and the last n steps
+  included.
+* "anywhere": from the sampled frame on, at most n steps, up to the demonstration's end. Step k of a
+  demonstration is then in min(k + 1, n) windows, with every history length equally often: it learns to act on
+  short histories everywhere, which is what it meets at inference after the history was cleared.
+* "mixed": frames with an even index by the first rule, odd ones by the second.
+
+A demonstration of L frames is therefore seen L times per epoch, long ones more often than short ones.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .frames import load_embeddings, load_frames
+
+if TYPE_CHECKING:
+    from .configuration_lansar import LanSARConfig
+
+POSITION_UNIT = 0.02  # m per 1.0 of a relative action (CALVIN)
+ORIENTATION_UNIT = 0.05  # rad per 1.0 of a relative action (CALVIN)
+ACTION_NAMES = {
+    "rel": ["delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper"],
+    "abs": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
+}
+
+
+def action_form(features: dict) -> str:
+    """Whether a dataset's `action` is relative ("rel") or absolute ("abs"), told by its names.
+
+    Raises:
+        ValueError: the names are neither.
+    """
+    names = features.get("action", {}).get("names")
+    for form, expected in ACTION_NAMES.items():
+        if names is not None and list(names) == expected:
+            return form
+    raise ValueError(
+        f"The dataset's action is named {names}; LanSAR must know whether it is relative "
+        f"{ACTION_NAMES['rel']} or absolute {ACTION_NAMES['abs']}. Datasets made by lansar-convert say so."
+    )
+
+
+def wrap_angles(angle: np.ndarray) -> np.ndarray:
+    """Angles in rad to (-pi, pi]."""
+    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
+
+
+def motion_targets(frames: dict[str, np.ndarray], form: str, target: str) -> np.ndarray:
+    """What the network should predict at every frame (thesis section 4.2, Eq 4.3-4.5).
+
+    Args:
+        frames: from `load_frames`.
+        form: "rel" or "abs", what the recorded action is.
+        target: "commanded": where the action wants the TCP minus where it is; a relative action is exactly
+            that, in units of (0.02 m, 0.05 rad). "achieved": where the TCP is one frame later minus where it
+            is; nothing for an episode's last frame, whose row is meaningless.
+
+    Returns:
+        (T, 7) float32: position (m), orientation (rad, wrapped to (-pi, pi]), gripper command 0 close / 1
+        open.
+    """
+    pose = frames["state"][:, :6].astype(np.float64)
+    action = frames["action"].astype(np.float64)
+    if target == "achieved":
+        delta = np.roll(pose, -1, axis=0) - pose
+    elif form == "abs":
+        delta = action[:, :6] - pose
+    else:
+        delta = action[:, :6] * ([POSITION_UNIT] * 3 + [ORIENTATION_UNIT] * 3)
+    delta[:, 3:] = wrap_angles(delta[:, 3:])
+    return np.concatenate([delta, action[:, 6:] > 0], axis=1).astype(np.float32)
+
+
+class Windows:
+    """Turns sampled frame numbers into batches of padded windows.
+
+    Args:
+        root: the LeRobotDataset's folder.
+        features: its features (`dataset.meta.features`).
+        total_frames: frames in the whole dataset.
+        config: the policy's options.
+
+    Attributes:
+        frames: the arrays of `load_frames`.
+        targets: (T, 7) from `motion_targets`.
+        has_target: (T,) bool, False for an episode's last frame with achieved targets.
+        embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
+        clip_info: clip.json's contents, empty without `use_images`.
+
+    Raises:
+        ValueError, FileNotFoundError: the dataset cannot be used; the message says why and what to do.
+    """
+
+    def __init__(self, root: Path, features: dict, total_frames: int, config: "LanSARConfig") -> None:
+        self.length, self.rule = config.window, config.window_start
+        form = action_form(features)
+        self.frames = load_frames(root)
+        self.targets = motion_targets(self.frames, form, config.target)
+        rows = np.arange(len(self.targets))
+        self.has_target: np.ndarray = np.ones(len(rows), dtype=bool)
+        if config.target == "achieved":
+            self.has_target = rows < self.frames["end"] - 1
+            if (self.frames["end"] - self.frames["first"] < 2).any():
+                raise ValueError(
+                    "--policy.target=achieved needs episodes of at least two frames; one is shorter."
+                )
+        self.embeddings: dict[str, np.ndarray] = {}
+        self.clip_info: dict = {}
+        if config.use_images:
+            self.embeddings, self.clip_info = load_embeddings(root, total_frames)
+            named = (self.clip_info["model"], self.clip_info["embed_dim"])
+            if named != (config.clip.model, config.network.clip_dim):
+                raise ValueError(
+                    f"The dataset's pictures were embedded with CLIP {named[0]} ({named[1]} numbers), the "
+                    f"policy is set to {config.clip.model} ({config.network.clip_dim}). Set "
+                    "--policy.clip.model and --policy.clip.pretrained to those of the conversion, or convert "
+                    "the dataset again."
+                )
+
+    def bounds(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [start, end) of the windows that sampled frames stand for.
+
+        Args:
+            index: (B,) absolute frame numbers.
+
+        Raises:
+            IndexError: a number the dataset does not have.
+        """
+        known = self.frames["index"]
+        row = np.searchsorted(known, index)
+        if (row >= len(known)).any() or (known[np.minimum(row, len(known) - 1)] != index).any():
+            raise IndexError("The batch holds a frame index that the dataset's parquet files do not have.")
+        first, end = self.frames["first"][row], self.frames["end"][row]
+        end = end - ~self.has_target[end - 1]  # a last frame without target is no step of any window
+        spare = np.maximum(end - first - self.length, 0)
+        spread = first + np.rint((row - first) * spare / np.maximum(end - first - 1, 1)).astype(np.int64)
+        spread = np.minimum(spread, first + spare)
+        anywhere = np.minimum(row, end - 1)
+        mixed = np.where(index % 2 == 0, spread, anywhere)
+        start = {"episode": spread, "anywhere": anywhere, "mixed": mixed}[self.rule]
+        return start, np.minimum(start + self.length, end)
+
+    def batch(self, index: np.ndarray) -> dict[str, Tensor]:
+        """Windows for sampled frames, padded at their end to the longest of this batch (n steps).
+
+        Args:
+            index: (B,) absolute frame numbers.
+
+        Returns:
+            state (B, n, 15), environment_state (B, n, 24), target (B, n, 7) float32, pad (B, n) bool, and
+            with `use_images` static and gripper (B, n, D) float32. Padded steps repeat the window's last
+            step.
+        """
+        start, end = self.bounds(index)
+        rows = start[:, None] + np.arange((end - start).max())
+        pad = rows >= end[:, None]
+        rows = np.minimum(rows, end[:, None] - 1)
+        out = {
+            "state": torch.from_numpy(self.frames["state"][rows]),
+            "environment_state": torch.from_numpy(self.frames["environment_state"][rows]),
+            "target": torch.from_numpy(self.targets[rows]),
+            "pad": torch.from_numpy(pad),
+        }
+        for name, array in self.embeddings.items():
+            out[name] = torch.from_numpy(array[self.frames["index"][rows]].astype(np.float32))
+        return out
+
+
+_current: list[Windows] = []
+
+
+def set_current(windows: Windows) -> None:
+    """Called by a policy built for training; the window step made right after it takes them from
+    `get_current`.
+
+    LeRobot gives the dataset's folder to the policy only, and rebuilds a checkpoint's pipeline from JSON
+    alone.
+    """
+    _current[:] = [windows]
+
+
+def get_current() -> Windows | None:
+    """The windows of the policy built last for training, None in an evaluation."""
+    return _current[0] if _current else None

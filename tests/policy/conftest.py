@@ -1,0 +1,139 @@
+"""A hand-made LeRobotDataset v3 in CALVIN's conventions, and small LanSARs, for the policy's tests."""
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+torch.set_num_threads(1)
+
+LENGTHS = (20, 90, 9, 64)
+COMMANDS = ("open the drawer", "lift the red block", "close the drawer", "turn on the lamp")
+SMALL = {
+    "device": "cpu",
+    "push_to_hub": False,
+    "hidden": 32,
+    "context_layers": 2,
+    "context_heads": 2,
+    "decoder_layers": 2,
+    "decoder_heads": 2,
+    "feedforward": 64,
+    "use_images": False,
+}
+
+
+def small_config(**options):
+    """A LanSARConfig small enough for tests, with lansar-tiny untrained."""
+    from lerobot_lansar.policy.clip import ClipConfig
+    from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+
+    return LanSARConfig(**{**SMALL, "clip": ClipConfig("lansar-tiny", ""), **options})
+
+
+def smooth_episode(rng: np.random.Generator, length: int) -> dict[str, np.ndarray]:
+    """State (15), environment state (24), absolute and relative action (7) of one episode."""
+    steps = np.arange(length)
+    state = np.zeros((length, 15))
+    state[:, :3] = rng.normal(0, 0.1, 3) + np.cumsum(rng.normal(0, 0.004, (length, 3)), axis=0)
+    state[:, 3:6] = [np.pi, 0, 1] + 0.05 * np.sin(steps[:, None] / 5 + rng.normal(0, 1, 3))
+    state[:, 3:6] = np.pi - np.mod(np.pi - state[:, 3:6], 2 * np.pi)
+    state[:, 6] = 0.04 + 0.04 * np.sin(steps / 9)
+    state[:, 7:14] = rng.normal(0, 1, 7) + 0.1 * np.sin(steps[:, None] / 7)
+    gripper = np.where(np.sin(steps / 6 + rng.normal()) > 0, 1.0, -1.0)
+    state[1:, 14], state[0, 14] = gripper[:-1], 1.0
+    environment = rng.normal(0, 0.2, 24) + 0.01 * np.sin(steps[:, None] / 8)
+    environment[:, 4:6] = rng.integers(0, 2, 2)
+    delta = rng.uniform(-1, 1, (length, 6)) * ([0.015] * 3 + [0.04] * 3)
+    absolute = np.concatenate([state[:, :6] + delta, gripper[:, None]], axis=1)
+    absolute[:, 3:6] = np.pi - np.mod(np.pi - absolute[:, 3:6], 2 * np.pi)
+    relative = np.concatenate([delta / ([0.02] * 3 + [0.05] * 3), gripper[:, None]], axis=1)
+    arrays = {"state": state, "environment": environment, "abs": absolute, "rel": relative}
+    return {name: value.astype(np.float32) for name, value in arrays.items()}
+
+
+def make_dataset(root: Path, form: str = "rel", lengths: tuple[int, ...] = LENGTHS, seed: int = 0):
+    """Write a LeRobotDataset without pictures; returns the episodes' arrays."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_lansar.policy.windows import ACTION_NAMES
+
+    def feature(size, names=None):
+        return {"dtype": "float32", "shape": (size,), "names": names}
+
+    features = {
+        "observation.state": feature(15),
+        "observation.environment_state": feature(24),
+        "action": feature(7, ACTION_NAMES[form]),
+    }
+    dataset = LeRobotDataset.create("test/desk", fps=30, features=features, root=root, use_videos=False)
+    rng = np.random.default_rng(seed)
+    episodes = [smooth_episode(rng, length) for length in lengths]
+    for i, episode in enumerate(episodes):
+        for t in range(lengths[i]):
+            frame = {
+                "observation.state": episode["state"][t],
+                "observation.environment_state": episode["environment"][t],
+                "action": episode[form][t],
+                "task": COMMANDS[i % len(COMMANDS)],
+            }
+            dataset.add_frame(frame)
+        dataset.save_episode()
+    dataset.finalize()
+    return episodes
+
+
+def add_embeddings(root: Path, clip) -> np.ndarray:
+    """Put made-up picture embeddings beside a dataset, as lansar-convert does; returns static's."""
+    from lerobot_lansar.policy.frames import CAMERAS, clip_dir, dataset_fingerprint
+
+    frames = json.loads((root / "meta" / "info.json").read_text())["total_frames"]
+    clip_dir(root).mkdir()
+    rng = np.random.default_rng(1)
+    arrays = {name: rng.normal(size=(frames, clip.embed_dim)).astype(np.float16) for name in CAMERAS}
+    for name, key in CAMERAS.items():
+        np.save(clip_dir(root) / f"{key}.npy", arrays[name])
+    info = {
+        "model": clip.config.model,
+        "pretrained": clip.config.pretrained,
+        "weights_sha256": clip.weights_sha256,
+        "embed_dim": clip.embed_dim,
+        "frames": frames,
+        "fingerprint": dataset_fingerprint(root),
+    }
+    (clip_dir(root) / "clip.json").write_text(json.dumps(info))
+    return arrays["static"]
+
+
+def dataset_meta(root: Path) -> SimpleNamespace:
+    """As much of LeRobot's dataset metadata as the policy asks for."""
+    info = json.loads((root / "meta" / "info.json").read_text())
+    return SimpleNamespace(root=root, features=info["features"], total_frames=info["total_frames"])
+
+
+def observation(rng: np.random.Generator, rows: int) -> dict[str, torch.Tensor]:
+    """An env observation as LeRobot hands it to the preprocessor."""
+    return {
+        "observation.state": torch.tensor(rng.normal(size=(rows, 15)), dtype=torch.float32),
+        "observation.environment_state": torch.tensor(rng.normal(size=(rows, 24)), dtype=torch.float32),
+        "observation.images.static": torch.tensor(rng.uniform(size=(rows, 3, 200, 200)), dtype=torch.float32),
+        "observation.images.gripper": torch.tensor(rng.uniform(size=(rows, 3, 84, 84)), dtype=torch.float32),
+    }
+
+
+@pytest.fixture(scope="session")
+def relative(tmp_path_factory):
+    """(root, episodes) of a dataset with relative actions; read-only."""
+    root = tmp_path_factory.mktemp("datasets") / "rel"
+    return root, make_dataset(root, "rel")
+
+
+@pytest.fixture(scope="session")
+def absolute(tmp_path_factory):
+    """The same episodes with absolute actions."""
+    root = tmp_path_factory.mktemp("datasets") / "abs"
+    return root, make_dataset(root, "abs")

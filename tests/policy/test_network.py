@@ -1,0 +1,212 @@
+"""The network alone: what it computes, what it may see, and what each ablation really removes."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import nn
+
+from lerobot_lansar.policy.network import (
+    BatchNorm,
+    DecoderLayer,
+    EncoderLayer,
+    LanSARNetwork,
+    NetworkConfig,
+)
+
+TINY = NetworkConfig(
+    clip_dim=12,
+    hidden=24,
+    context_layers=2,
+    context_heads=2,
+    decoder_layers=2,
+    decoder_heads=2,
+    feedforward=32,
+    window=8,
+)
+
+
+def windows(config, lengths, seed=0):
+    """Random inputs of windows of the given lengths, as keyword arguments of the network."""
+    generator = torch.Generator().manual_seed(seed)
+    rows, steps = len(lengths), max(lengths)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return {
+        "command": draw(rows, config.clip_dim),
+        "state": draw(rows, steps, config.state_dim),
+        "blocks": draw(rows, steps, 3, config.block_dim),
+        "scene": draw(rows, steps, config.scene_dim),
+        "valid": torch.arange(steps) < torch.tensor(lengths)[:, None],
+        "static": draw(rows, steps, config.clip_dim),
+        "gripper": draw(rows, steps, config.clip_dim),
+    }
+
+
+def build(**options):
+    torch.manual_seed(0)
+    return LanSARNetwork(replace(TINY, **options))
+
+
+def gradient_reaches(network, name):
+    """Whether the predictions depend on the input called `name`."""
+    inputs = windows(network.config, [5, 5])
+    inputs[name] = inputs[name].requires_grad_()
+    motion, logit = network.eval()(**inputs)
+    (motion.sum() + logit.sum()).backward()
+    gradient = inputs[name].grad
+    return gradient is not None and bool(gradient.abs().sum() > 0)
+
+
+def test_layers_compute_what_pytorchs_transformer_layers_compute():
+    torch.manual_seed(0)
+    h, heads = 24, 4
+    x, memory = torch.randn(3, 6, h), torch.randn(3, 6, h)
+    causal = nn.Transformer.generate_square_subsequent_mask(6)
+    encoder = EncoderLayer(h, heads, 32, 0.1).eval()
+    decoder = DecoderLayer(h, heads, 32, 0.1).eval()
+    torch_encoder = nn.TransformerEncoderLayer(h, heads, 32, batch_first=True).eval()
+    torch_decoder = nn.TransformerDecoderLayer(h, heads, 32, batch_first=True).eval()
+
+    def copy_attention(ours, theirs):
+        parts = (ours.query, ours.key, ours.value)
+        theirs.in_proj_weight.data = torch.cat([part.weight for part in parts]).detach()
+        theirs.in_proj_bias.data = torch.cat([part.bias for part in parts]).detach()
+        theirs.out_proj.load_state_dict(ours.out.state_dict())
+
+    copy_attention(encoder.attention, torch_encoder.self_attn)
+    copy_attention(decoder.self_attention, torch_decoder.self_attn)
+    copy_attention(decoder.cross_attention, torch_decoder.multihead_attn)
+    for ours, theirs in ((encoder, torch_encoder), (decoder, torch_decoder)):
+        theirs.linear1.load_state_dict(ours.feedforward[0].state_dict())
+        theirs.linear2.load_state_dict(ours.feedforward[3].state_dict())
+
+    torch.testing.assert_close(encoder(x), torch_encoder(x), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(encoder(x, queries=1), torch_encoder(x)[:, :1], rtol=1e-4, atol=1e-5)
+    expected = torch_decoder(x, memory, tgt_mask=causal, memory_mask=causal)
+    torch.testing.assert_close(decoder(x, memory), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("prepended", [False, True])
+def test_a_step_is_not_changed_by_what_comes_after_it(prepended):
+    network = build(command_prepended=prepended).eval()
+    inputs = windows(TINY, [6])
+    before = network(**inputs)[0]
+    for name in ("state", "blocks", "scene", "static", "gripper"):
+        inputs[name] = inputs[name].clone()
+        inputs[name][:, 4:] += 100
+    after = network(**inputs)[0]
+    assert torch.equal(before[:4], after[:4])
+    assert not torch.allclose(before[4], after[4])
+
+
+def test_every_earlier_step_is_seen():
+    network = build().eval()
+    inputs = windows(TINY, [6])
+    inputs["state"].requires_grad_()
+    network(**inputs)[0][-1].sum().backward()
+    assert (inputs["state"].grad[0].abs().sum(dim=1) > 0).all()
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer"])
+def test_padding_changes_nothing_in_training_mode_either(norm):
+    network = build(mlp_norm=norm, dropout=0.0).train()
+    inputs = windows(TINY, [6, 3])
+    motion, logit = network(**inputs)
+    wild = {name: value.clone() for name, value in inputs.items()}
+    for name in ("state", "blocks", "scene", "static", "gripper"):
+        wild[name][1, 3:] = 1e6
+    torch.testing.assert_close(network(**wild)[0], motion, rtol=0, atol=0)
+
+    longer = {name: value.clone() for name, value in inputs.items()}
+    for name in ("state", "blocks", "scene", "static", "gripper", "valid"):
+        pad = torch.zeros_like(longer[name][:, :2])
+        longer[name] = torch.cat([longer[name], pad], dim=1)
+    torch.testing.assert_close(network(**longer)[0], motion, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(network(**longer)[1], logit, rtol=1e-4, atol=1e-5)
+
+
+def test_encoding_and_decoding_step_by_step_is_the_same_as_the_window_at_once():
+    network = build().eval()
+    inputs = windows(TINY, [5])
+    expected = network(**inputs)[0]
+    commands = network.encode_command(inputs["command"])
+    names = ("state", "blocks", "scene", "static", "gripper")
+    contexts = torch.cat([network.encode_context(*(inputs[n][:, t] for n in names)) for t in range(5)])
+    states = network.state_target(inputs["state"][0])
+    motion = network.predict(network.decode(contexts[None], states[None], commands)[0])[0]
+    torch.testing.assert_close(motion, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_dropped_modalities_have_no_token_no_parameter_and_no_influence():
+    full, no_images = build(), build(use_images=False)
+    no_spatial = build(use_spatial_context=False)
+    assert full.context_tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S", "I", "G"]
+    assert no_images.context_tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S"]
+    assert no_spatial.context_tokens == ["CLS", "I", "G"]
+    for name in ("command", "state", "blocks", "scene", "static", "gripper"):
+        assert gradient_reaches(full, name)
+        assert gradient_reaches(no_images, name) == (name not in ("static", "gripper"))
+        assert gradient_reaches(no_spatial, name) == (name not in ("blocks", "scene"))  # the target keeps X
+    assert not [name for name, _ in no_images.named_parameters() if "static" in name or "gripper_c" in name]
+    assert not [name for name, _ in no_spatial.named_parameters() if "block" in name or "scene" in name]
+
+
+def test_a_context_sees_the_command_only_when_asked_to():
+    inputs = windows(TINY, [4])
+    for in_context in (False, True):
+        network = build(command_in_context=in_context).eval()
+        command = torch.randn(4, TINY.hidden, requires_grad=True)
+        names = ("state", "blocks", "scene", "static", "gripper")
+        context = network.encode_context(*(inputs[name][0] for name in names), command)
+        (gradient,) = torch.autograd.grad(context.sum(), command, allow_unused=True)
+        assert (gradient is not None) == in_context == ("C" in network.context_tokens)
+
+
+def test_a_prepended_command_stands_once_at_the_front():
+    steps, command = torch.ones(1, 3, TINY.hidden), torch.zeros(1, TINY.hidden)
+    kinds = {
+        prepended: build(command_prepended=prepended)._with_command(steps, command)[0, :, 0].tolist()
+        for prepended in (False, True)
+    }
+    assert kinds == {False: [0, 1, 0, 1, 0, 1], True: [0, 1, 1, 1]}
+
+
+def test_the_thesis_size_has_the_parameters_table_4_2_implies():
+    h, feedforward = 512, 2048
+    attention, norm = 4 * (h * h + h), 2 * h
+    mixing = h * feedforward + feedforward + feedforward * h + h
+
+    def mlp(*sizes, last=True):  # linear + BatchNorm each; a head's last linear has none
+        total = sum(a * b + b + 2 * b for a, b in pairwise(sizes))
+        return total if last else total - 2 * sizes[-1]
+
+    inputs = [512, 512, 15, 15, 6, 6, 512, 512]  # C twice, X twice, B, S, I, G
+    expected = sum(mlp(size, h // 3, 2 * h // 3, h) for size in inputs)
+    expected += mlp(h, 256, 64, 6, last=False) + mlp(h, 256, 64, 1, last=False)
+    expected += 6 * (attention + mixing + 2 * norm) + 6 * (2 * attention + mixing + 3 * norm)
+    expected += h + 8 * h + 2 * 128 * h  # CLS, modality positions, memory and target positions
+    network = LanSARNetwork(NetworkConfig())
+    assert sum(p.numel() for p in network.parameters()) == expected
+    assert 40e6 < expected < 60e6
+
+
+def test_weights_start_xavier_uniform_and_biases_zero():
+    network = LanSARNetwork(replace(TINY, hidden=64))
+    for module in network.modules():
+        if isinstance(module, nn.Linear | nn.Embedding):
+            bound = (6 / sum(module.weight.shape)) ** 0.5
+            assert 0.8 * bound < module.weight.abs().max() <= bound
+        if isinstance(module, nn.Linear):
+            assert (module.bias == 0).all()
+
+
+def test_a_single_row_passes_batch_norm_in_training():
+    norm = BatchNorm(4).train()
+    assert norm(torch.randn(1, 4)).isfinite().all()
+    network = build().train()
+    motion, _ = network(**windows(TINY, [1]))
+    assert motion.shape == (1, 6)

@@ -1,0 +1,364 @@
+"""The policy as LeRobot drives it: loss, histories, actions, checkpoints, errors."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from lerobot_lansar.policy.clip import Clip, ClipConfig, embedding_size
+from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+from lerobot_lansar.policy.processor_lansar import ClipStep, make_lansar_pre_post_processors
+from lerobot_lansar.policy.scheduler import LinearWarmupDecaySchedulerConfig
+
+from .conftest import COMMANDS, LENGTHS, add_embeddings, dataset_meta, make_dataset, observation, small_config
+
+
+def make_policy(seed=0, **options):
+    torch.manual_seed(seed)
+    return LanSARPolicy(small_config(**options)).eval()
+
+
+def step(policy, rng, tasks, **extra):
+    """One control step on a random observation; returns the batch the policy saw and its action."""
+    rows = len(tasks)
+    batch = observation(rng, rows)
+    generator = torch.Generator().manual_seed(len(tasks[0]))
+    size = embedding_size(policy.config.clip.model)
+    batch["observation.clip.command"] = torch.stack(
+        [torch.full((size,), float(len(task))) + torch.randn(size, generator=generator) for task in tasks]
+    )
+    for name in ("static", "gripper"):
+        batch[f"observation.clip.{name}"] = torch.randn(rows, size, generator=generator)
+    batch |= {"task": list(tasks), **extra}
+    return batch, policy.select_action(batch)
+
+
+def sampled_frames(*index):
+    """What LeRobot's data loader gives the preprocessor: single frames, whose contents go unread."""
+    frames = {"index": torch.tensor(index), "task": list(COMMANDS[: len(index)])}
+    frames["observation.state"] = torch.zeros(len(index), 15)
+    frames["observation.environment_state"] = torch.zeros(len(index), 24)
+    return {**frames, "action": torch.zeros(len(index), 7)}
+
+
+class FixedPrediction(nn.Module):
+    """A head that always predicts the same."""
+
+    def __init__(self, *values):
+        super().__init__()
+        self.values = nn.Parameter(torch.tensor(values))
+
+    def forward(self, x):
+        return self.values.expand(len(x), -1)
+
+
+def with_prediction(policy, delta, logit):
+    policy.network.motion_head, policy.network.gripper_head = FixedPrediction(*delta), FixedPrediction(logit)
+    return policy
+
+
+def test_the_loss_is_eq_4_6_on_scaled_targets_over_valid_steps(relative):
+    config = small_config(dropout=0.0, window_start="anywhere")
+    policy = LanSARPolicy(config, dataset_meta=dataset_meta(relative[0])).eval()
+    preprocess, _ = make_lansar_pre_post_processors_for(policy)
+    batch = preprocess(sampled_frames(0, 25, 115))
+    loss, parts = policy.forward(batch)
+
+    valid = ~batch["action_is_pad"]
+    assert valid.sum().item() == 20 + 64 + 4
+    x, blocks, scene = policy.scaler.encode(
+        batch["observation.state"], batch["observation.environment_state"]
+    )
+    motion, logit = policy.network(batch["observation.clip.command"], x, blocks, scene, valid)
+    goal = batch["action"][valid]
+    true = (goal[:, :6] - policy.scaler.delta_mean) / policy.scaler.delta_std
+    error = (motion - true).abs()
+    smooth = torch.where(error < 0.1, 0.5 * error**2 / 0.1, error - 0.05)
+    probability = torch.sigmoid(logit)
+    cross_entropy = -(goal[:, 6] * probability.log() + (1 - goal[:, 6]) * (1 - probability).log()).mean()
+    expected = smooth[:, :3].mean() + smooth[:, 3:].mean() + cross_entropy
+    torch.testing.assert_close(loss, expected)
+    assert sum(parts.values()) == pytest.approx(loss.item(), rel=1e-5)
+
+
+def make_lansar_pre_post_processors_for(policy):
+    config = policy.config
+    config.input_features, config.output_features = config.input_features or {}, config.output_features or {}
+    return make_lansar_pre_post_processors(config)
+
+
+def test_an_absolute_action_is_the_pose_plus_the_unscaled_difference_with_the_thesis_constants():
+    thesis = {"position_scale_start": 3.0, "position_scale_slope": 1.0, "yaw_scale": 1.5, "window": 4}
+    policy = with_prediction(make_policy(**thesis), [1, 2, 3, 0.1, 0.2, 0.3], -1.0)
+    policy.scaler.delta_mean[:] = torch.tensor([0.01, 0, 0, 0, 0, 0])
+    policy.scaler.delta_std[:] = 0.1
+    rng = np.random.default_rng(0)
+    for length in (1, 2, 3, 4, 4):  # the history grows, then slides
+        batch, action = step(policy, rng, ["open the drawer"])
+        pose = batch["observation.state"][0, :6]
+        scale = 3 - length / 4
+        position = pose[:3] + torch.tensor([0.11, 0.2, 0.3]) * scale
+        torch.testing.assert_close(action[0, :3], position)
+        turned = pose[3:] + torch.tensor([0.01, 0.02, 0.03 * 1.5])
+        expected = torch.atan2(turned.sin(), turned.cos())
+        torch.testing.assert_close(action[0, 3:6], expected, atol=1e-5, rtol=0)
+        assert action[0, 6] == -1
+
+
+def test_an_absolute_orientation_is_wrapped():
+    policy = with_prediction(make_policy(), [0, 0, 0, 0.2, 0, 0], 1.0)
+    rng = np.random.default_rng(0)
+    batch = observation(rng, 1) | {"observation.clip.command": torch.zeros(1, 64), "task": ["a"]}
+    batch["observation.state"][0, 3] = 3.1
+    action = policy.select_action(batch)
+    assert action[0, 3].item() == pytest.approx(3.3 - 2 * math.pi, abs=1e-5)
+    assert action[0, 6] == 1
+
+
+def test_a_relative_action_is_the_difference_in_calvins_units_clipped():
+    policy = with_prediction(make_policy(control_mode="rel"), [0.01, -0.5, 0.02, 0.025, -9, 0], 1.0)
+    _, action = step(policy, np.random.default_rng(0), ["open the drawer"])
+    torch.testing.assert_close(action, torch.tensor([[0.5, -1, 1, 0.5, -1, 0, 1]]))
+
+
+def test_kept_contexts_give_what_the_whole_window_at_once_gives():
+    policy = make_policy(window=4)
+    rng = np.random.default_rng(0)
+    seen = []
+    for _ in range(6):
+        batch, action = step(policy, rng, ["open the drawer"])
+        seen.append(batch)
+        window = seen[-4:]
+        state = torch.stack([b["observation.state"][0] for b in window])[None]
+        environment = torch.stack([b["observation.environment_state"][0] for b in window])[None]
+        valid = torch.ones(1, len(window), dtype=torch.bool)
+        inputs = policy.scaler.encode(state, environment)
+        motion, _ = policy.network(batch["observation.clip.command"], *inputs, valid)
+        torch.testing.assert_close(action[0, :3], state[0, -1, :3] + motion[-1, :3], atol=1e-5, rtol=1e-4)
+
+
+def test_a_history_is_cleared_for_the_row_whose_command_changes_and_after_the_set_steps():
+    policy = make_policy(history_clear_steps=5, window=4)
+    rng = np.random.default_rng(0)
+    lengths = []
+    for t in range(8):
+        tasks = ["open the drawer", "lift the red block" if t < 3 else "close the drawer"]
+        step(policy, rng, tasks)
+        lengths.append([len(history.contexts) for history in policy._histories])
+    assert [row[0] for row in lengths] == [1, 2, 3, 4, 4, 1, 2, 3]
+    assert [row[1] for row in lengths] == [1, 2, 3, 1, 2, 3, 4, 4]
+    policy.reset()
+    step(policy, rng, ["open the drawer", "close the drawer"])
+    assert [len(history.contexts) for history in policy._histories] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"mlp_norm": "layer"}, {"use_images": True, "command_in_context": True}]
+)
+def test_an_action_does_not_depend_on_its_neighbours_not_even_in_the_last_bit(options):
+    config = small_config(window=4, **options)
+    torch.manual_seed(0)
+    policy = LanSARPolicy(config).eval()
+    preprocess, _ = make_lansar_pre_post_processors_for(policy)
+    rng = np.random.default_rng(0)
+    tasks = [["open the drawer"] * 3 if t < 3 else ["open the drawer", "lift", "drop it"] for t in range(6)]
+    observations = [observation(rng, 3) for _ in tasks]
+    together = [
+        policy.select_action(preprocess({**o, "task": list(task)}))
+        for o, task in zip(observations, tasks, strict=True)
+    ]
+    for row in range(3):
+        policy.reset()
+        for o, task, expected in zip(observations, tasks, together, strict=True):
+            alone = {name: value[row : row + 1] for name, value in o.items()}
+            action = policy.select_action(preprocess({**alone, "task": [task[row]]}))
+            assert torch.equal(action[0], expected[row])
+
+
+def test_batched_decoding_as_on_a_gpu_agrees_with_one_by_one():
+    policy = make_policy(window=4)
+    rng = np.random.default_rng(0)
+    for t in range(5):
+        tasks = ["open the drawer", "lift" if t < 3 else "drop it"]
+        before = [list(vars(h).values()) for h in policy._histories]
+        batch, action = step(policy, rng, tasks)
+        if t == 0:
+            histories = policy._recall(tasks)
+            policy.reset()
+            histories = policy._recall(tasks)
+        else:
+            histories = [type(h)(*values) for h, values in zip(policy._histories, before, strict=True)]
+            for history, task in zip(histories, tasks, strict=True):
+                if history.command != task:
+                    blank = policy._blank(task)
+                    history.__dict__.update(vars(blank))
+        keys = ("observation.state", "observation.environment_state", "observation.clip.command")
+        kept = policy._histories
+        torch.testing.assert_close(
+            policy._act(histories, *(batch[k] for k in keys)), action, atol=1e-5, rtol=1e-4
+        )
+        if t == 0:
+            policy._histories = histories
+        else:
+            policy._histories = kept
+
+
+def test_a_control_mode_that_disagrees_with_the_env_is_an_error_naming_both_options():
+    policy, rng = make_policy(control_mode="abs"), np.random.default_rng(0)
+    step(policy, rng, ["open the drawer"], **{"observation.control_mode": torch.ones(1, 1)})
+    with pytest.raises(ValueError, match=r"--env.control_mode=abs or --policy.control_mode=rel"):
+        step(policy, rng, ["open the drawer"], **{"observation.control_mode": torch.zeros(1, 1)})
+
+
+def test_bad_observations_are_named():
+    policy, rng = make_policy(), np.random.default_rng(0)
+    batch, _ = step(policy, rng, ["a", "a"])
+    broken = batch["observation.state"].clone()
+    broken[1, 3] = float("nan")
+    with pytest.raises(ValueError, match=r"observation.state is NaN or infinite in environment \[1\]"):
+        policy.select_action({**batch, "observation.state": broken})
+    with pytest.raises(ValueError, match=r"must be \(B, 15\)"):
+        policy.select_action({**batch, "observation.state": broken[:, :7]})
+    with pytest.raises(ValueError, match="command per environment"):
+        policy.select_action({**batch, "task": None})
+
+
+def test_impossible_options_are_refused_with_the_option_named():
+    for option, value in (("target", "acheived"), ("hidden", 33), ("window", 0), ("orientation", "quat")):
+        with pytest.raises(ValueError, match=rf"--policy.{option}|--policy.context_heads"):
+            small_config(**{option: value})
+    with pytest.raises(ValueError, match=r"--policy.use_spatial_context=false"):
+        small_config(use_images=False, use_spatial_context=False)
+    with pytest.raises(ValueError, match=r"--policy.clip.model='nope'"):
+        LanSARPolicy(small_config(clip=ClipConfig("nope", "")))
+
+
+def test_missing_features_are_named():
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    config = small_config()
+    config.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (6,))}
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+    with pytest.raises(
+        ValueError, match=r"shape \(6,\), not \(15,\); observation.environment_state is missing"
+    ):
+        LanSARPolicy(config)
+
+
+def test_a_policy_without_pictures_says_what_to_do_when_one_needs_them():
+    policy = make_policy(use_images=True)
+    preprocess, _ = make_lansar_pre_post_processors_for(policy)
+    batch = {k: v for k, v in observation(np.random.default_rng(0), 1).items() if "images" not in k}
+    with pytest.raises(ValueError, match=r"--env.cameras="):
+        preprocess({**batch, "task": ["open the drawer"]})
+
+
+def test_a_checkpoint_carries_statistics_and_clip_weights(tmp_path):
+    from lerobot.policies.factory import make_pre_post_processors
+
+    root = tmp_path / "data"
+    make_dataset(root, lengths=(6, 9))
+    torch.manual_seed(3)
+    other = Clip(ClipConfig("lansar-tiny", ""))
+    for parameter in other.model.parameters():
+        parameter.data += 0.01 * torch.randn_like(parameter)
+    weights = tmp_path / "clip.pt"
+    torch.save(other.model.state_dict(), weights)
+    clip = ClipConfig("lansar-tiny", str(weights))
+    add_embeddings(root, Clip(clip))
+
+    policy = LanSARPolicy(small_config(use_images=True, clip=clip), dataset_meta=dataset_meta(root))
+    preprocess, postprocess = make_lansar_pre_post_processors_for(policy)
+    policy.train()
+    loss, _ = policy.forward(preprocess(sampled_frames(0, 7)))
+    loss.backward()
+    policy.eval()
+    for part in (policy, preprocess, postprocess):
+        part.save_pretrained(tmp_path / "checkpoint")
+    weights.unlink()
+
+    from lerobot_lansar.policy import windows
+
+    windows._current.clear()  # as in a new process
+    loaded = LanSARPolicy.from_pretrained(tmp_path / "checkpoint")
+    assert not torch.equal(loaded.scaler.state_mean, torch.zeros(18))
+    again, _ = make_pre_post_processors(loaded.config, str(tmp_path / "checkpoint"))
+    batch = observation(np.random.default_rng(0), 2) | {"task": list(COMMANDS[:2])}
+    expected = policy.select_action(preprocess(dict(batch)))
+    assert torch.equal(loaded.select_action(again(dict(batch))), expected)
+
+
+def test_embeddings_made_with_other_clip_weights_are_refused(tmp_path):
+    root = tmp_path / "data"
+    make_dataset(root, lengths=(6,))
+    clip = Clip(ClipConfig("lansar-tiny", ""))
+    clip.weights_sha256 = "f" * 64
+    add_embeddings(root, clip)
+    policy = LanSARPolicy(small_config(use_images=True), dataset_meta=dataset_meta(root))
+    preprocess, _ = make_lansar_pre_post_processors_for(policy)
+    with pytest.raises(
+        ValueError, match=r"pictures were embedded with other weights.*--policy.clip.pretrained"
+    ):
+        preprocess(sampled_frames(0))
+    with pytest.raises(ValueError, match=r"policy was trained with other weights"):
+        ClipStep("lansar-tiny", "", weights_sha256="e" * 64).clip("cpu")
+
+
+def test_clip_embeds_both_image_layouts_alike_and_tells_commands_apart():
+    clip = Clip(ClipConfig("lansar-tiny", ""))
+    images = np.random.default_rng(0).integers(0, 256, (2, 84, 84, 3), dtype=np.uint8)
+    floats = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
+    assert clip.embed_dim == embedding_size("lansar-tiny") == 64
+    torch.testing.assert_close(clip.encode_images(images), clip.encode_images(floats), rtol=0, atol=0)
+    texts = F.normalize(clip.encode_texts(["open the drawer", "close the drawer", "lift the red block"]))
+    assert (texts @ texts.T).fill_diagonal_(0).max() < 0.95
+    with pytest.raises(ValueError, match="uint8"):
+        clip.encode_images(images[0])
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    assert Clip(ClipConfig("lansar-tiny", "")).weights_sha256 == clip.weights_sha256
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_openais_weights_get_the_activation_they_were_trained_with(monkeypatch):
+    import open_clip
+
+    seen = {}
+
+    def create_model(name, pretrained=None, **options):
+        seen.update(options, pretrained=pretrained)
+        raise RuntimeError("stop here")
+
+    monkeypatch.setattr(open_clip, "create_model", create_model)
+    with pytest.raises(RuntimeError, match="stop here"):
+        Clip(ClipConfig())
+    assert seen == {"pretrained": "openai", "force_quick_gelu": True}
+    with pytest.raises(ValueError, match="neither a weights file nor a tag"):
+        Clip(ClipConfig("ViT-B-32", "no-such-tag"))
+
+
+def test_the_schedule_warms_up_for_4_percent_and_falls_to_zero():
+    optimizer = torch.optim.AdamW([nn.Parameter(torch.zeros(1))], lr=4e-4)
+    schedule = LinearWarmupDecaySchedulerConfig().build(optimizer, 30000)
+    factor = schedule.lr_lambdas[0]
+    assert factor(0) == pytest.approx(1 / 1201)
+    assert factor(600) == pytest.approx(0.5, abs=1e-3)
+    assert factor(1200) == 1.0
+    assert factor(15600) == pytest.approx(0.5)
+    assert factor(30000) == 0.0
+    values = [factor(s) for s in range(0, 30001, 50)]
+    assert max(values) == 1.0
+    assert np.argmax(values) == 1200 // 50
+
+
+def test_the_training_presets_are_table_4_2s():
+    config = LanSARConfig(device="cpu")
+    optimizer = config.get_optimizer_preset()
+    assert (optimizer.lr, optimizer.weight_decay) == (4e-4, 0.01)
+    assert config.get_scheduler_preset().warmup_fraction == 5 / 125
+    assert config.observation_delta_indices is config.action_delta_indices is None
+    assert sum(LENGTHS) > 0

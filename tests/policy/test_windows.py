@@ -1,0 +1,223 @@
+"""Frames, targets and windows against plain references."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_lansar.policy import frames as frames_module
+from lerobot_lansar.policy.clip import Clip, ClipConfig
+from lerobot_lansar.policy.frames import CACHE, dataset_fingerprint, load_frames
+from lerobot_lansar.policy.scaling import INPUT_FLOOR, Scaler, wrap
+from lerobot_lansar.policy.windows import Windows, action_form
+
+from .conftest import LENGTHS, add_embeddings, dataset_meta, make_dataset, small_config
+
+STARTS = np.cumsum((0, *LENGTHS))[:-1]
+
+
+def make_windows(root, **options):
+    meta = dataset_meta(root)
+    return Windows(meta.root, meta.features, meta.total_frames, small_config(**options))
+
+
+def episode_of(index):
+    """(episode, frame within it) of an absolute frame number."""
+    episode = int(np.searchsorted(STARTS, index, side="right") - 1)
+    return episode, index - STARTS[episode]
+
+
+def reference_target(episode, form, target, t):
+    """One frame's target with plain Python."""
+    state, action = episode["state"].astype(float), episode[form].astype(float)
+    if target == "achieved":
+        delta = [float(b - a) for a, b in zip(state[t, :6], state[t + 1, :6], strict=True)]
+    elif form == "rel":
+        delta = [*(action[t, :3] * 0.02), *(action[t, 3:6] * 0.05)]
+    else:
+        delta = list(action[t, :6] - state[t, :6])
+    for i in (3, 4, 5):
+        while delta[i] > math.pi:
+            delta[i] -= 2 * math.pi
+        while delta[i] <= -math.pi:
+            delta[i] += 2 * math.pi
+    return [*delta, 1.0 if action[t, 6] > 0 else 0.0]
+
+
+@pytest.mark.parametrize(
+    ("form", "target"), [("rel", "commanded"), ("abs", "commanded"), ("rel", "achieved")]
+)
+def test_a_batch_of_windows_is_what_a_plain_loop_gives(form, target, relative, absolute):
+    root, episodes = relative if form == "rel" else absolute
+    windows = make_windows(root, target=target, window_start="anywhere")
+    index = np.array([0, 19, 25, 109, 110, 182, 119])
+    batch = windows.batch(index)
+    for row, i in enumerate(index):
+        number, t = episode_of(i)
+        episode = episodes[number]
+        usable = LENGTHS[number] - (target == "achieved")
+        t = min(t, usable - 1)
+        length = min(64, usable - t)
+        assert (~batch["pad"][row]).sum() == length
+        assert not batch["pad"][row, :length].any()
+        steps = slice(t, t + length)
+        np.testing.assert_array_equal(batch["state"][row, :length], episode["state"][steps])
+        np.testing.assert_array_equal(batch["environment_state"][row, :length], episode["environment"][steps])
+        expected = [reference_target(episode, form, target, s) for s in range(t, t + length)]
+        np.testing.assert_allclose(batch["target"][row, :length], expected, atol=2e-6)
+    assert batch["state"].shape[1] == 64
+
+
+def test_relative_and_absolute_actions_teach_the_same(relative, absolute):
+    np.testing.assert_allclose(
+        make_windows(relative[0]).targets, make_windows(absolute[0]).targets, atol=2e-6
+    )
+    assert (
+        np.abs(make_windows(absolute[0]).targets[:, 3:6]).max() < 0.05
+    )  # the roll crosses pi, its change does not
+
+
+def test_windows_of_a_demonstration_start_where_the_rule_says(relative):
+    index = np.arange(sum(LENGTHS))
+    starts = {}
+    for rule in ("episode", "anywhere", "mixed"):
+        start, end = make_windows(relative[0], window_start=rule).bounds(index)
+        assert (end - start).max() == 64
+        starts[rule] = start
+        for number, first in enumerate(STARTS):  # never across a demonstration's bounds
+            rows = slice(first, first + LENGTHS[number])
+            assert start[rows].min() == first
+            assert end[rows].max() == first + LENGTHS[number]
+    short, long = slice(STARTS[0], STARTS[1]), slice(STARTS[1], STARTS[2])
+    assert (starts["episode"][short] == STARTS[0]).all()
+    offsets, counts = np.unique(starts["episode"][long] - STARTS[1], return_counts=True)
+    assert offsets.tolist() == list(range(90 - 64 + 1))  # first and last 64 steps included
+    assert counts.max() <= 2 * counts[1:-1].min()
+    assert (starts["anywhere"] == index).all()
+    even = index % 2 == 0
+    assert (starts["mixed"][even] == starts["episode"][even]).all()
+    assert (starts["mixed"][~even] == starts["anywhere"][~even]).all()
+
+
+def test_frame_arrays_are_kept_and_made_again_when_the_data_changes(tmp_path, monkeypatch):
+    make_dataset(tmp_path / "a", lengths=(5, 7))
+    make_dataset(tmp_path / "b", lengths=(5, 7), seed=9)
+    first = load_frames(tmp_path / "a")
+    assert isinstance(first["state"], np.memmap)
+    assert (tmp_path / "a" / CACHE).is_dir()
+    with monkeypatch.context() as patch:
+        patch.setattr(frames_module, "read_frames", lambda root: pytest.fail("read the parquet files again"))
+        np.testing.assert_array_equal(load_frames(tmp_path / "a")["state"], first["state"])
+    assert dataset_fingerprint(tmp_path / "a") != dataset_fingerprint(tmp_path / "b")
+    shutil.copytree(tmp_path / "a", tmp_path / "moved")
+    assert dataset_fingerprint(tmp_path / "a") == dataset_fingerprint(tmp_path / "moved")
+    shutil.rmtree(tmp_path / "a" / "data")
+    shutil.copytree(tmp_path / "b" / "data", tmp_path / "a" / "data")
+    np.testing.assert_array_equal(load_frames(tmp_path / "a")["state"], load_frames(tmp_path / "b")["state"])
+    assert {p.name for p in (tmp_path / "a").iterdir()} == {
+        "data",
+        "meta",
+        CACHE,
+    }  # nothing half-written left
+
+
+def test_a_folder_that_cannot_be_written_to_is_read_into_memory(tmp_path, monkeypatch, relative):
+    shutil.copytree(relative[0], tmp_path / "d", ignore=shutil.ignore_patterns(CACHE))
+
+    def refuse(self, *args, **kwargs):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.mkdir", refuse)
+    frames = load_frames(tmp_path / "d")
+    assert len(frames["state"]) == sum(LENGTHS)
+    assert not (tmp_path / "d" / CACHE).exists()
+
+
+def test_nan_in_a_dataset_is_named(tmp_path, monkeypatch):
+    episodes = make_dataset(tmp_path / "d", lengths=(6,))
+    assert len(episodes) == 1
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = frames_module.data_files(tmp_path / "d")[0]
+    table = pq.read_table(path)
+    values = table["action"].to_pylist()
+    values[3][2] = float("nan")
+    column = table.schema.get_field_index("action")
+    pq.write_table(table.set_column(column, "action", pa.array(values, table["action"].type)), path)
+    with pytest.raises(ValueError, match=r"action is NaN or infinite in episode 0 \(index 3\)"):
+        load_frames(tmp_path / "d")
+
+
+def test_actions_without_calvins_names_are_refused(relative):
+    features = dataset_meta(relative[0]).features
+    assert action_form(features) == "rel"
+    with pytest.raises(ValueError, match="relative"):
+        action_form({**features, "action": {"names": ["motor_0"]}})
+    with pytest.raises(ValueError, match="relative"):
+        action_form({})
+
+
+def test_pictures_need_embeddings_of_this_dataset(tmp_path, relative):
+    root = tmp_path / "d"
+    shutil.copytree(relative[0], root)
+    with pytest.raises(FileNotFoundError, match=r"lansar-convert --embed=true"):
+        make_windows(root, use_images=True)
+    clip = Clip(ClipConfig("lansar-tiny", ""))
+    static = add_embeddings(root, clip)
+    batch = make_windows(root, use_images=True, window_start="anywhere").batch(np.array([21, 30]))
+    np.testing.assert_array_equal(batch["static"][0], static[21:85].astype(np.float32))
+    with pytest.raises(ValueError, match=r"--policy.clip.model"):
+        make_windows(root, use_images=True, clip=ClipConfig("ViT-B-32", "openai"))
+    info = json.loads((root / "clip" / "clip.json").read_text())
+    (root / "clip" / "clip.json").write_text(json.dumps({**info, "fingerprint": "0" * 64}))
+    with pytest.raises(ValueError, match="other frames"):
+        make_windows(root, use_images=True)
+
+
+def test_an_unknown_frame_number_is_an_error(relative):
+    with pytest.raises(IndexError):
+        make_windows(relative[0]).batch(np.array([sum(LENGTHS)]))
+
+
+def test_scaled_inputs_have_mean_0_and_sigma_1_and_binary_values_stay(relative):
+    windows = make_windows(relative[0])
+    state = torch.tensor(windows.frames["state"])
+    environment = torch.tensor(windows.frames["environment_state"])
+    environment[:, 2] = 1e-5 * torch.randn(len(environment))  # a button nobody pressed
+    for orientation in ("euler", "sincos"):
+        scaler = Scaler(orientation)
+        scaler.fit(state, environment, torch.tensor(windows.targets[:, :6]))
+        x, blocks, scene = scaler.encode(state, environment)
+        torch.testing.assert_close(x[:, :3].mean(0), torch.zeros(3), atol=1e-3, rtol=0)
+        torch.testing.assert_close(x[:, :3].std(0), torch.ones(3), atol=1e-2, rtol=0)
+        assert blocks.shape[1:] == (3, 9 if orientation == "sincos" else 6)
+        torch.testing.assert_close(x[:, -1], state[:, 14], rtol=0, atol=0)
+        torch.testing.assert_close(scene[:, 4:], environment[:, 4:6], rtol=0, atol=0)
+        assert scene[:, 2].abs().max() < 1e-4 / INPUT_FLOOR
+        delta = torch.tensor(windows.targets[:, :6])
+        torch.testing.assert_close(
+            scaler.unscale_delta(scaler.scale_delta(delta)), delta, atol=1e-6, rtol=1e-5
+        )
+
+
+def test_sine_and_cosine_do_not_jump_where_euler_angles_do():
+    near_pi = torch.zeros(2, 15)
+    near_pi[:, 3] = torch.tensor([math.pi - 1e-3, -math.pi + 1e-3])
+    environment = torch.zeros(2, 24)
+    jump = {}
+    for orientation in ("euler", "sincos"):
+        x = Scaler(orientation).encode(near_pi, environment)[0]
+        jump[orientation] = float((x[0] - x[1]).abs().max())
+    assert jump["euler"] > 6
+    assert jump["sincos"] < 0.01
+
+
+def test_wrapping_goes_to_minus_pi_exclusive_pi_inclusive():
+    angles = torch.tensor([0.0, 3.5, -3.5, 7.0], dtype=torch.float64)
+    expected = torch.tensor([0.0, 3.5 - 2 * math.pi, 2 * math.pi - 3.5, 7 - 2 * math.pi], dtype=torch.float64)
+    torch.testing.assert_close(wrap(angles), expected)
+    assert wrap(torch.tensor(-math.pi, dtype=torch.float64)) == math.pi
