@@ -106,13 +106,13 @@ def evaluate(name: str, checkpoint: Path) -> Path:
             "--env.control_mode=abs",
             "--env.cameras=[]",
             "--env.render_fps=6",
-            f"--env.results_dir={folder / 'episodes'}",
+            f"--env.results_dir={folder}",
             f"--eval.n_episodes={EPISODES_PER_TASK}",
             "--eval.batch_size=10",
             f"--seed={EVALUATION_SEED}",
             f"--output_dir={folder}",
         )
-    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}")
+    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}")
     return folder
 
 

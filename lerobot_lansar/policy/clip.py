@@ -60,8 +60,7 @@ def _model_config(model: str) -> dict[str, Any]:
     if config is None:
         raise ValueError(
             f"--policy.clip.model={model!r} is not known to open_clip. Examples: ViT-B-32, ViT-L-14, "
-            "lansar-tiny; "
-            'all names: python -c "import open_clip; print(open_clip.list_models())"'
+            'lansar-tiny; all names: python -c "import open_clip; print(open_clip.list_models())"'
         )
     return config
 
@@ -111,9 +110,7 @@ class Clip:
         # Without weights of its own choice open_clip warns of a random model; here that is meant, or about to
         # be replaced by a checkpoint's weights.
         with torch.random.fork_rng(devices=[]), _quiet_logging():
-            torch.manual_seed(
-                0
-            )  # random weights are the same every time, and the caller's seed is left alone
+            torch.manual_seed(0)  # the same random weights every time; the caller's generator is left alone
             model = open_clip.create_model(
                 config.model,
                 pretrained=config.pretrained if weights is None and config.pretrained else None,

@@ -42,6 +42,8 @@ class LanSARConfig(PreTrainedConfig):
         command_prepended: the command stands once at the front instead of before every step (Table 5.3).
         orientation: how euler angles enter the network. "euler" as they are, "sincos" without the +-pi jump
             (the gripper's roll sits there). Predicted are wrapped differences either way.
+        egocentric_blocks: blocks also come as seen from the TCP, with finer steps near it, so that the network
+            need not learn to subtract two positions.
         target: what the motion head learns: "commanded" = the recorded action minus the current pose;
             "achieved" = the next pose minus the current pose (thesis).
         window_start: which windows are trained on, see `windows.py`. "episode" = from the demonstration's
@@ -73,6 +75,7 @@ class LanSARConfig(PreTrainedConfig):
     command_prepended: bool = False
 
     orientation: str = "sincos"
+    egocentric_blocks: bool = False
     target: str = "commanded"
     window_start: str = "mixed"
 
@@ -123,7 +126,7 @@ class LanSARConfig(PreTrainedConfig):
     @property
     def network(self) -> NetworkConfig:
         """The network's part of the options."""
-        state, block, scene = encoded_sizes(self.orientation)
+        state, block, scene = encoded_sizes(self.orientation, self.egocentric_blocks)
         return NetworkConfig(
             state_dim=state,
             block_dim=block,

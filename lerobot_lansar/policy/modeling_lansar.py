@@ -26,12 +26,14 @@ class History:
 
     Attributes:
         command: the sentence being carried out.
+        projections: C for the memory and for the target, (1, h) each; None before the first step.
         steps: control steps since then; the window below may be shorter.
         contexts: E of the last steps, (length, h); each is computed once and kept.
         states: X_target of the last steps, (length, h).
     """
 
     command: str
+    projections: tuple[Tensor, Tensor] | None
     steps: int
     contexts: Tensor
     states: Tensor
@@ -60,7 +62,7 @@ class LanSARPolicy(PreTrainedPolicy):
     ) -> None:
         super().__init__(config)
         config.validate_features()
-        self.scaler = Scaler(config.orientation)
+        self.scaler = Scaler(config.orientation, config.egocentric_blocks)
         self.network = LanSARNetwork(config.network)
         if dataset_meta is not None:
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
@@ -128,7 +130,8 @@ class LanSARPolicy(PreTrainedPolicy):
         Raises:
             ValueError: wrong shapes, NaN, or an env in the other control mode.
         """
-        self.eval()
+        if self.training:
+            self.eval()
         state, environment_state = batch[OBS_STATE].float(), batch[OBS_ENV_STATE].float()
         self._check(batch, state, environment_state)
         inputs = [state, environment_state, batch[CLIP_COMMAND]]
@@ -176,7 +179,7 @@ class LanSARPolicy(PreTrainedPolicy):
 
     def _blank(self, command: str) -> History:
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
-        return History(command, 0, empty, empty)
+        return History(command, None, 0, empty, empty)
 
     def _act(
         self,
@@ -190,7 +193,11 @@ class LanSARPolicy(PreTrainedPolicy):
         """Take one step into the histories and decide: (b, 15), (b, 24), (b, D)... -> (b, 7)."""
         config, network = self.config, self.network
         x, blocks, scene = self.scaler.encode(state, environment_state)
-        commands = network.encode_command(command)
+        for i, history in enumerate(histories):
+            if history.projections is None:
+                history.projections = network.encode_command(command[i : i + 1])
+        projections = [h.projections for h in histories if h.projections is not None]
+        commands = torch.cat([c for c, _ in projections]), torch.cat([c for _, c in projections])
         contexts = network.encode_context(x, blocks, scene, static, gripper, commands[0])  # (b, h)
         states = network.state_target(x)
         for i, history in enumerate(histories):

@@ -42,8 +42,7 @@ class WindowStep(ProcessorStep):
     """Replaces sampled frames by the windows they stand for (`windows.py`); passes batches without `index`.
 
     It has no options of its own: the windows belong to the policy being trained, so that options given on the
-        command
-    line hold in a resumed or fine-tuned run too, where LeRobot would restore a step's saved ones.
+    command line hold in a resumed or fine-tuned run too, where LeRobot would restore a step's saved ones.
     """
 
     windows: Windows | None = field(default_factory=get_current, init=False, repr=False)

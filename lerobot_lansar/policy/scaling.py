@@ -14,6 +14,7 @@ DELTA_DIM = 6  # position (m) and orientation (rad) difference
 # A column that hardly moves in the data (a button nobody pressed) is divided by this instead of its sigma, in
 # its own unit (m or rad): dividing by the sigma of noise would blow up the first real movement at inference.
 INPUT_FLOOR = 1e-2
+NEAR = 0.05  # m; within this distance of the TCP a block's relative position is given in finer steps
 DELTA_FLOOR = 1e-3
 
 
@@ -22,10 +23,10 @@ def wrap(angle: Tensor) -> Tensor:
     return math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
 
 
-def encoded_sizes(orientation: str) -> tuple[int, int, int]:
+def encoded_sizes(orientation: str, egocentric_blocks: bool) -> tuple[int, int, int]:
     """Numbers per robot state, block and scene after `Scaler.encode`."""
     extra = 3 if orientation == "sincos" else 0
-    return STATE_DIM + extra, 6 + extra, SCENE_DIM
+    return STATE_DIM + extra, 6 + extra + (6 if egocentric_blocks else 0), SCENE_DIM
 
 
 class Scaler(nn.Module):
@@ -43,10 +44,11 @@ class Scaler(nn.Module):
     delta_mean: Tensor
     delta_std: Tensor
 
-    def __init__(self, orientation: str) -> None:
+    def __init__(self, orientation: str, egocentric_blocks: bool) -> None:
         super().__init__()
         self.orientation = orientation
-        state, block, scene = encoded_sizes(orientation)
+        self.egocentric_blocks = egocentric_blocks
+        state, block, scene = encoded_sizes(orientation, egocentric_blocks)
         sizes = {"state": state, "blocks": BLOCKS * block, "scene": scene, "delta": DELTA_DIM}
         for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -62,11 +64,15 @@ class Scaler(nn.Module):
 
     def _encode(self, state: Tensor, environment_state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x = torch.cat([self._angles(state[..., :6]), state[..., 6:]], dim=-1)
-        blocks = self._angles(environment_state[..., SCENE_DIM:].unflatten(-1, (BLOCKS, 6))).flatten(-2)
-        return x, blocks, environment_state[..., :SCENE_DIM]
+        pose = environment_state[..., SCENE_DIM:].unflatten(-1, (BLOCKS, 6))
+        blocks = self._angles(pose)
+        if self.egocentric_blocks:
+            offset = pose[..., :3] - state[..., None, :3]  # from the TCP, (..., 3, 3)
+            blocks = torch.cat([blocks, offset, (offset / NEAR).tanh()], dim=-1)
+        return x, blocks.flatten(-2), environment_state[..., :SCENE_DIM]
 
     def encode(self, state: Tensor, environment_state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """CALVIN's (..., 15) and (..., 24) -> scaled X (..., 15 or 18), B (..., 3, 6 or 9), S (..., 6)."""
+        """CALVIN's (..., 15) and (..., 24) -> scaled X (..., 15 or 18), B (..., 3, 6 to 15), S (..., 6)."""
         x, blocks, scene = self._encode(state, environment_state)
         x = (x - self.state_mean) / self.state_std
         blocks = (blocks - self.blocks_mean) / self.blocks_std

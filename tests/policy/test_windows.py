@@ -189,7 +189,7 @@ def test_scaled_inputs_have_mean_0_and_sigma_1_and_binary_values_stay(relative):
     environment = torch.tensor(windows.frames["environment_state"])
     environment[:, 2] = 1e-5 * torch.randn(len(environment))  # a button nobody pressed
     for orientation in ("euler", "sincos"):
-        scaler = Scaler(orientation)
+        scaler = Scaler(orientation, egocentric_blocks=False)
         scaler.fit(state, environment, torch.tensor(windows.targets[:, :6]))
         x, blocks, scene = scaler.encode(state, environment)
         torch.testing.assert_close(x[:, :3].mean(0), torch.zeros(3), atol=1e-3, rtol=0)
@@ -210,7 +210,7 @@ def test_sine_and_cosine_do_not_jump_where_euler_angles_do():
     environment = torch.zeros(2, 24)
     jump = {}
     for orientation in ("euler", "sincos"):
-        x = Scaler(orientation).encode(near_pi, environment)[0]
+        x = Scaler(orientation, egocentric_blocks=False).encode(near_pi, environment)[0]
         jump[orientation] = float((x[0] - x[1]).abs().max())
     assert jump["euler"] > 6
     assert jump["sincos"] < 0.01
