@@ -82,6 +82,7 @@ def train(name: str, *options: str) -> Path:
     checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
     if not checkpoint.exists():
         shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses a folder that an interrupted run left
+        shutil.rmtree(OUT / f"eval_{name}", ignore_errors=True)  # of an earlier checkpoint
         run(
             f"train ({name})",
             "lerobot-train",
@@ -141,7 +142,7 @@ def main() -> None:
     os.chdir(ROOT)
     started = time.time()
     record_and_convert()
-    trained = evaluate("trained", train("train"))
+    trained = evaluate("trained", train("trained"))
     # One update with learning rate 0: the same network and statistics, untrained weights.
     untrained = evaluate("untrained", train("untrained", "--steps=1", "--policy.learning_rate=0"))
     tasks = success(trained)

@@ -31,7 +31,7 @@ def write_frames(folder: Path, frames: dict[str, np.ndarray], scene: Scene) -> N
     ``scene_obs`` comes with blocks in red, blue, pink order and goes to disk in the scene's original order, which is
     what CALVIN's own files have.
     """
-    partial = folder.with_name(folder.name + ".partial")
+    partial = folder.with_name(f"{folder.name}-{os.getpid()}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     data = dict(frames)

@@ -33,7 +33,7 @@ class Demonstration:
 def relative_action(action: np.ndarray, robot_obs: np.ndarray) -> np.ndarray:
     """CALVIN's ``rel_actions``: the way from the present TCP pose to the commanded one in units of 0.02 m and 0.05
     rad, clipped to +-1, with angles taken the short way round; (7,)."""
-    rotation = (action[3:6] - robot_obs[3:6] + np.pi) % (2 * np.pi) - np.pi
+    rotation = _wrap(action[3:6] - robot_obs[3:6])
     return np.concatenate(
         [
             np.clip((action[:3] - robot_obs[:3]) / POSITION_STEP, -1, 1),
@@ -98,8 +98,12 @@ def demonstrate(desk: Desk, task: str, rng: np.random.Generator, noise: float = 
 
 
 def _error(waypoint: Waypoint, robot_obs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    turn = (waypoint.euler - robot_obs[3:6] + np.pi) % (2 * np.pi) - np.pi
-    return waypoint.position - robot_obs[:3], turn
+    return waypoint.position - robot_obs[:3], _wrap(waypoint.euler - robot_obs[3:6])
+
+
+def _wrap(angles: np.ndarray) -> np.ndarray:
+    """Angles (rad) brought into [-pi, pi)."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
 def _toward(
@@ -114,7 +118,7 @@ def _toward(
     return np.concatenate(
         [
             robot_obs[:3] + np.clip(distance, -step, step),
-            robot_obs[3:6] + np.clip(turn, -ANGLE_STEP * speed, ANGLE_STEP * speed),
+            _wrap(robot_obs[3:6] + np.clip(turn, -ANGLE_STEP * speed, ANGLE_STEP * speed)),
             [waypoint.gripper],
         ]
     )

@@ -1,10 +1,16 @@
 """``lansar-record``: scripted demonstrations on the desk, in CALVIN's own on-disk format."""
 
+import fcntl
 import json
 import multiprocessing
+import os
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -79,25 +85,53 @@ def record(config: RecordConfig) -> Path:
     scene, kind = _look(config)
     output, staging = config.output_dir, config.output_dir / ".recording"
     commands = load_commands(config.annotations)
-    if (output / "training").exists() and (output / "validation").exists() and not staging.exists():
+    if (output / "training").exists() and (output / "validation").exists():
+        shutil.rmtree(staging, ignore_errors=True)  # a run may have ended while it tidied up
         raise DeskError(f"{output} already holds a recording; give another --output_dir or delete it first")
-    _claim(staging, config)
+    staging.mkdir(parents=True, exist_ok=True)
+    with _locked(staging):
+        _claim(staging, config)
+        recordings = _record_all(config, commands)
+        _publish(config, recordings, scene, kind, commands)
+        shutil.rmtree(staging)
+    _summarise(config, recordings)
+    return output
+
+
+def _record_all(config: RecordConfig, commands: dict[str, list[str]]) -> list[Recording]:
+    """Records the episodes that are not there yet; returns all of them in order."""
+    staging = config.output_dir / ".recording"
     assert config.validation_episodes is not None
     total = config.episodes + config.validation_episodes
     missing = [k for k in range(total) if not (staging / f"{k:06d}.json").exists()]
     _run(config, missing, total)
-    recordings = [_recording(staging, k, commands, config) for k in range(total)]
+    return [_recording(staging, k, commands, config) for k in range(total)]
+
+
+def _publish(
+    config: RecordConfig, recordings: list[Recording], scene: Scene, kind: str, commands: dict[str, list[str]]
+) -> None:
     details = {**config.request(), "assets_used": kind, "control_hz": CONTROL_HZ}
     frame = 0
     for split, part in (
         ("training", recordings[: config.episodes]),
         ("validation", recordings[config.episodes :]),
     ):
-        shutil.rmtree(output / split, ignore_errors=True)  # of an earlier try that stopped between the two
-        frame = publish_split(output / split, part, scene, frame, details, commands)
-    shutil.rmtree(staging)
-    _summarise(config, recordings)
-    return output
+        shutil.rmtree(config.output_dir / split, ignore_errors=True)  # of a try that ended between the two
+        frame = publish_split(config.output_dir / split, part, scene, frame, details, commands)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keeps a second process out of ``folder``; the lock ends with its process, however it ends."""
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise DeskError(f"another process is recording into {folder.parent}") from None
+    finally:
+        os.close(lock)
 
 
 def _look(config: RecordConfig) -> tuple[Scene, str]:
@@ -117,7 +151,8 @@ def _claim(staging: Path, config: RecordConfig) -> None:
                 f"{file}"
             )
         return
-    staging.mkdir(parents=True, exist_ok=True)
+    for leftover in staging.iterdir():  # without its request nothing tells what these episodes are
+        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
     partial = file.with_suffix(".partial")
     partial.write_text(json.dumps(request, indent=1))
     partial.rename(file)
@@ -136,11 +171,27 @@ def _done(config: RecordConfig, missing: list[int]) -> Iterator[None]:
         yield from map(_record_one, missing)
         return
     context = multiprocessing.get_context("spawn")
-    with context.Pool(config.workers, initializer=_open_desk, initargs=(config,)) as pool:
-        yield from pool.imap_unordered(_record_one, missing)
+    with ProcessPoolExecutor(config.workers, context, _start_worker, (config, os.getpid())) as pool:
+        futures = [pool.submit(_record_one, index) for index in missing]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 _worker: tuple[RecordConfig, Desk]
+
+
+def _start_worker(config: RecordConfig, parent: int) -> None:
+    def follow_parent() -> None:  # a killed parent must not leave writers behind
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    threading.Thread(target=follow_parent, daemon=True).start()
+    _open_desk(config)
 
 
 def _open_desk(config: RecordConfig) -> None:
@@ -167,7 +218,7 @@ def _record_one(index: int) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     write_frames(folder, demonstration.frames, desk.scene)
     note = {"task": task, "frames": len(demonstration), "attempts": attempt + 1}
-    partial = staging / f"{index:06d}.partial.json"
+    partial = staging / f".{index:06d}-{os.getpid()}.partial"
     partial.write_text(json.dumps(note))
     partial.rename(staging / f"{index:06d}.json")
 
@@ -192,7 +243,7 @@ def main() -> None:
     """Entry point of ``lansar-record``."""
     try:
         record(draccus.parse(RecordConfig))
-    except (DeskError, draccus.utils.ParsingError) as error:
+    except (DeskError, OSError, draccus.utils.ParsingError) as error:
         print(f"lansar-record: error: {error}", file=sys.stderr)
         sys.exit(2)
 

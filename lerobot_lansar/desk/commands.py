@@ -159,7 +159,10 @@ def load_commands(file: str | Path | None) -> dict[str, list[str]]:
     path = Path(file)
     if not path.is_file():
         raise DeskError(f"annotations file {path} does not exist")
-    content = yaml.safe_load(path.read_text())
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise DeskError(f"annotations file {path} is not YAML: {error}") from error
     if not isinstance(content, dict):
         raise DeskError(
             f"annotations file {path} must map task names to sentences, got {type(content).__name__}"

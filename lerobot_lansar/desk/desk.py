@@ -48,21 +48,20 @@ class Desk:
         assets: str | Path | None = None,
         cameras: Sequence[str] = ("static", "gripper"),
     ):
-        for camera in cameras:
-            if camera not in CAMERAS:
-                raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+        _check_cameras(cameras)
         self.scene: Scene = get_scene(scene)
         self.cameras = tuple(cameras)
         self._client = -1
         with open_assets(self.scene, assets) as files:
             self.assets = files.kind
             self._client = p.connect(p.DIRECT)
+            self._require_open()
             try:
                 self._load(files)
+                self.reset()
             except BaseException:
                 self.close()
                 raise
-        self.reset()
 
     def _load(self, files: Assets) -> None:
         client = self._client
@@ -130,6 +129,7 @@ class Desk:
 
     def observe(self) -> Observation:
         """``robot_obs``, ``scene_obs`` and a picture ``rgb_<camera>`` (uint8) per camera."""
+        self._require_open()
         obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
         if not all(np.isfinite(state).all() for state in obs.values()):
             raise SimulationError(
@@ -142,6 +142,7 @@ class Desk:
     def render(self, camera: str = "static", size: int | None = None) -> np.ndarray:
         """A picture of the present state, (size, size, 3) uint8; ``size`` in pixels, the camera's own by default."""
         self._require_open()
+        _check_cameras((camera,))
         self._table.show_lights()
         view = static_view() if camera == "static" else gripper_view(*self._robot.camera_pose())
         return take_picture(self._client, CAMERAS[camera], view, size)
@@ -196,7 +197,7 @@ class Desk:
 
     def _require_open(self) -> None:
         if self._client < 0:
-            raise DeskError("this desk is closed; make a new one")
+            raise DeskError("this desk is closed, or Bullet had no client left for it; make a new one")
 
     def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
         self._table.reset(scene_state[:6])
@@ -246,6 +247,12 @@ class Desk:
             # the longest block's half diagonal is 0.045 m
             if all(np.hypot(a[0] - b[0], a[1] - b[1]) > 0.09 for a, b in itertools.combinations(poses, 2)):
                 return np.array([0.0] * 6 + [x for pose in poses for x in pose])
+
+
+def _check_cameras(cameras: Sequence[str]) -> None:
+    for camera in cameras:
+        if camera not in CAMERAS:
+            raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
 
 
 def _vector(values: Any, length: int, name: str) -> np.ndarray:

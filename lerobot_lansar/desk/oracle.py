@@ -114,6 +114,7 @@ def _place(surface: Touch) -> Task:
 
 
 def _push_into_drawer(start: Snapshot, end: Snapshot) -> bool:
+    # The hand may still touch the block at the end: the original's recorded verdicts say so.
     return any(
         start.blocks[color].contacts == {TABLE} and DRAWER in end.blocks[color].contacts
         for color in start.blocks

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -161,11 +162,13 @@ class CalvinEnv(gym.Env):
                 }
             )
         finished = failed or len(self._done) == len(self._commands)
+        info = self._info()
         if finished:
             self._write_result()
+            self._commands = ()
         elif fulfilled:
             self._begin_command()
-        return self._observation(obs), float(fulfilled), finished, False, self._info()
+        return self._observation(obs), float(fulfilled), finished, False, info
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The static camera's picture, (200, 200, 3) uint8."""
@@ -214,15 +217,14 @@ class CalvinEnv(gym.Env):
     def _refuse_other_mode(self, action: np.ndarray) -> None:
         """Catches a policy of the other control mode at its first action, before it costs an evaluation.
 
-        A hand above the desk points down, so an absolute roll is near +-pi and an absolute height above 0.2 m;
-        relative actions lie within +-1.
+        A hand above the desk points down, so an absolute roll is near +-pi; a relative one lies within +-1.
         """
         if action.shape != (7,) or not np.isfinite(action).all():
             return  # the desk says what is wrong
-        if self.control_mode == "rel" and np.abs(action[:6]).max() > 2:
-            looks, other = f"absolute: a component is {np.abs(action[:6]).max():.2f}, not within +-1", "abs"
-        elif self.control_mode == "abs" and action[2] < 0.2 and np.abs(action[3]) <= 1:
-            looks, other = f"relative: height {action[2]:.2f} m and roll {action[3]:.2f} rad", "rel"
+        if self.control_mode == "rel" and abs(action[3]) > 2 and 0.2 < action[2] < 1.2:
+            looks, other = f"absolute: height {action[2]:.2f} m and roll {action[3]:.2f} rad", "abs"
+        elif self.control_mode == "abs" and abs(action[3]) <= 1:
+            looks, other = f"relative: roll {action[3]:.2f} rad, a hand that points up", "rel"
         else:
             return
         raise DeskError(
@@ -241,8 +243,10 @@ class CalvinEnv(gym.Env):
             "commands": self._done,
             "successes": sum(command["success"] for command in self._done),
             "assets": self._desk.assets,
+            "renderer": "tiny" if self._desk.cameras else None,
             "control_mode": self.control_mode,
             "steps_per_command": self.steps_per_command,
+            "version": version("lerobot_policy_lansar"),
         }
         self._results_dir.mkdir(parents=True, exist_ok=True)
         with open(self._results_dir / f"episodes-{os.getpid()}.jsonl", "a") as file:
@@ -268,6 +272,7 @@ def _observation_space(cameras: tuple[str, ...]) -> spaces.Dict:
 def _action_space(control_mode: str) -> spaces.Box:
     if control_mode == "rel":
         return spaces.Box(-1, 1, (7,), np.float32)
-    low = np.array([-1.0, -1.0, 0.2, -np.pi, -np.pi, -np.pi, -1.0], dtype=np.float32)
-    high = np.array([1.0, 1.0, 1.0, np.pi, np.pi, np.pi, 1.0], dtype=np.float32)
+    # any turn of an angle is understood; the roll's range is that of a hand that points down
+    low = np.array([-1.0, -1.0, 0.2, np.pi / 2, -np.pi, -np.pi, -1.0], dtype=np.float32)
+    high = np.array([1.0, 1.0, 1.0, np.pi * 3 / 2, np.pi, np.pi, 1.0], dtype=np.float32)
     return spaces.Box(low, high, dtype=np.float32)

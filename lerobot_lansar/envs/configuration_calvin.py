@@ -1,13 +1,12 @@
 """``--env.type=calvin``: the options of the CALVIN desk in LeRobot's commands, and its vector environments."""
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from ..desk.cameras import CAMERAS
@@ -37,6 +36,11 @@ class CalvinEnvConfig(EnvConfig):
     render_fps: int = 30
 
     def __post_init__(self) -> None:
+        if self.max_parallel_tasks != 1:
+            raise DeskError(
+                "--env.max_parallel_tasks must be 1: LeRobot's parallel tasks share one policy object, which would "
+                "mix the episodes' histories"
+            )
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (7,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (15,)),
@@ -74,16 +78,38 @@ class CalvinEnvConfig(EnvConfig):
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task: ``{task: {0: environment}}``.
 
-        Finished episodes freeze instead of being simulated on, and workers are forked here, before a policy
-        exists: a fresh interpreter would import all of LeRobot (20 s and 0.9 GB each).
+        Finished episodes freeze instead of being simulated on. Workers are forked: a fresh interpreter would import
+        all of LeRobot (20 s and 0.9 GB each). The first task's are forked here, in ``lerobot-eval`` before the
+        policy exists, the others' when their turn comes.
         """
         tasks = [task.strip() for task in (self.task or LH_MTLC).split(",")]
-        return {task: {0: self._vector_env(task, n_envs, use_async_envs)} for task in tasks}
+        makers = {
+            task: [functools.partial(CalvinEnv, task=task, **self.gym_kwargs)] * n_envs for task in tasks
+        }
+        if not use_async_envs or n_envs == 1:
+            mode = gym.vector.AutoresetMode.NEXT_STEP
+            return {
+                task: {
+                    0: gym.vector.SyncVectorEnv(
+                        [freeze_after_episode_end(make) for make in made], autoreset_mode=mode
+                    )
+                }
+                for task, made in makers.items()
+            }
+        envs = {task: ForkedVectorEnv(made) for task, made in makers.items()}
+        envs[tasks[0]]._ensure()
+        return {task: {0: env} for task, env in envs.items()}  # type: ignore[dict-item]
 
-    def _vector_env(self, task: str, n_envs: int, use_async_envs: bool) -> gym.vector.VectorEnv:
-        make: Callable[[], gym.Env] = functools.partial(CalvinEnv, task=task, **self.gym_kwargs)
-        makers = [freeze_after_episode_end(make)] * n_envs
-        mode = gym.vector.AutoresetMode.NEXT_STEP
-        if use_async_envs and n_envs > 1:
-            return gym.vector.AsyncVectorEnv(makers, context="fork", autoreset_mode=mode)
-        return gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
+
+class ForkedVectorEnv(_LazyAsyncVectorEnv):
+    """LeRobot's asynchronous environments that start at first use and freeze finished episodes, in forked workers."""
+
+    _env: gym.vector.AsyncVectorEnv | None
+
+    def _ensure(self) -> None:
+        if self._env is None:
+            self._env = gym.vector.AsyncVectorEnv(
+                [freeze_after_episode_end(make) for make in self._env_fns],
+                context="fork",
+                autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
+            )

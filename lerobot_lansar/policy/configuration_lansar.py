@@ -30,6 +30,9 @@ class LanSARConfig(PreTrainedConfig):
     with targets from the commanded action (a probe found them to be the first lever), an orientation input
     without the jump at +-pi, and inference that takes the prediction as it is.
 
+    A resumed or fine-tuned run keeps the checkpoint's scaling statistics, which its weights are made for; leave
+    `target`, `orientation`, `egocentric_blocks` and `clip` as they were trained.
+
     Attributes:
         hidden, context_layers, context_heads, decoder_layers, decoder_heads, feedforward, dropout: Table 4.2;
             8 decoder heads, since the table's 6 do not divide 512.
@@ -91,6 +94,9 @@ class LanSARConfig(PreTrainedConfig):
     yaw_scale: float = 1.0
 
     clip: ClipConfig = field(default_factory=ClipConfig)
+
+    # Uploading is asked for, not the default: --policy.push_to_hub=true --policy.repo_id=you/name.
+    push_to_hub: bool = False
 
     # LanSAR scales with statistics of its own, kept in the checkpoint; LeRobot's normaliser changes nothing.
     normalization_mapping: dict[str, NormalizationMode] = field(

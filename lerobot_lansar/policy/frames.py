@@ -9,7 +9,6 @@ here: `lansar-convert` puts them into `<root>/clip` (see `clip_dir`).
 import hashlib
 import json
 import logging
-import os
 import shutil
 import uuid
 from pathlib import Path
@@ -120,43 +119,28 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
 
 
 def load_frames(root: Path) -> dict[str, np.ndarray]:
-    """`read_frames` through the cache in `<root>/.lansar_frames`; memory-mapped, read-only.
+    """`read_frames` through the cache in `<root>/.lansar_frames/<fingerprint>`; memory-mapped, read-only.
 
     A half-written cache is never seen: it is written beside and renamed. In a folder that cannot be written
     to the arrays are kept in memory, and read again next time.
     """
     root = Path(root)
-    cache = root / CACHE
-    fingerprint = dataset_fingerprint(root)
-    if not _is_current(cache, fingerprint):
+    cache = root / CACHE / dataset_fingerprint(root)[:16]
+    if not cache.is_dir():
         frames = read_frames(root)
+        scratch = root / CACHE / f"{uuid.uuid4().hex}.partial"
         try:
-            scratch = root / f"{CACHE}-{uuid.uuid4().hex}"
-            scratch.mkdir()
-        except OSError as error:
-            logging.warning(f"Cannot keep LanSAR's frame arrays in {cache} ({error.strerror}).")
-            return frames
-        try:
+            scratch.mkdir(parents=True)
             for name, values in frames.items():
                 np.save(scratch / f"{name}.npy", values)
-            (scratch / "fingerprint").write_text(fingerprint)
-            if not _is_current(cache, fingerprint):  # another process may have been faster
-                shutil.rmtree(cache, ignore_errors=True)
-                os.replace(scratch, cache)
-        except OSError:
-            if not _is_current(cache, fingerprint):
-                raise
-        finally:
+            scratch.rename(cache)
+        except OSError as error:
             shutil.rmtree(scratch, ignore_errors=True)
+            if not cache.is_dir():  # no other process was faster
+                logging.warning(f"Cannot keep LanSAR's frame arrays in {cache} ({error.strerror}).")
+                return frames
     names = ("index", *COLUMNS, "first", "end")
     return {name: np.load(cache / f"{name}.npy", mmap_mode="r") for name in names}
-
-
-def _is_current(cache: Path, fingerprint: str) -> bool:
-    try:
-        return (cache / "fingerprint").read_text() == fingerprint
-    except OSError:
-        return False
 
 
 def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray], dict]:
@@ -180,7 +164,8 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
     if missing:
         raise FileNotFoundError(
             f"{folder} lacks {', '.join(missing)}: the dataset has no CLIP embeddings of its pictures. "
-            "Convert it with `lansar-convert --embed=true`, or train without: --policy.use_images=false."
+            "Convert it with `lansar-convert --embed=true`, or train without: --policy.use_images=false. "
+            "(With --dataset.episodes LeRobot fetches only a part from the hub: download the whole dataset.)"
         )
     info = json.loads((folder / "clip.json").read_text())
     arrays = {name: np.load(folder / f"{key}.npy", mmap_mode="r") for name, key in CAMERAS.items()}
@@ -190,6 +175,7 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
         raise ValueError(
             f"The CLIP embeddings in {folder} were made for other frames than the dataset now has "
             f"(arrays {shapes}, expected {shape}, or another fingerprint). "
-            "Delete that folder and convert again with `lansar-convert --embed=true`."
+            "Delete that folder and convert again with `lansar-convert --embed=true`; if the dataset came from "
+            "the hub with --dataset.episodes, download all of it."
         )
     return arrays, info

@@ -105,6 +105,11 @@ class ClipStep(ProcessorStep):
             ValueError: it is not the one the policy or the dataset's embeddings were made with.
         """
         if self._clip is None:
+            if self._windows is not None and self._windows.clip.model != self.model:
+                raise ValueError(
+                    f"The checkpoint reads CLIP {self.model} embeddings; --policy.clip.model="
+                    f"{self._windows.clip.model} cannot be changed when resuming or fine-tuning. Leave it out."
+                )
             clip = Clip(ClipConfig(self.model, self.pretrained), device, self._weights)
             made_with = {"policy was trained": self.weights_sha256}
             if self._windows is not None and self._windows.clip_info:

@@ -98,6 +98,7 @@ class Windows:
         has_target: (T,) bool, False for an episode's last frame with achieved targets.
         embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
         clip_info: clip.json's contents, empty without `use_images`.
+        clip: the policy's choice of CLIP.
 
     Raises:
         ValueError, FileNotFoundError: the dataset cannot be used; the message says why and what to do.
@@ -116,6 +117,7 @@ class Windows:
                 raise ValueError(
                     "--policy.target=achieved needs episodes of at least two frames; one is shorter."
                 )
+        self.clip = config.clip
         self.embeddings: dict[str, np.ndarray] = {}
         self.clip_info: dict = {}
         if config.use_images:

@@ -124,9 +124,12 @@ def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | Non
     """
     episodes = []
     for entry in entries:
-        task = entry["task_group"] if _is_task(entry["task_group"]) else None
+        group = entry["task_group"]
+        task = group if _is_task(group) else None
         # One task per entry, or one entry for all lines: chains, or a single task in a group of another name.
         own = [line for line in lines if task is None or (line.chain is None and line.commands[0][0] == task)]
+        if group == "lh_mtlc":
+            own = [line for line in own if line.chain is not None]
         first = seed if seed is not None else min((line.seed for line in own), default=DEFAULT_SEED)
         by_seed: dict[int, Episode] = {}
         for line in own:

@@ -92,16 +92,17 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
     target = tmp_path / "desk"
     command = [
         sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", "--seed=3", "--cameras=[]",
-        "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4", "--validation_episodes=2",
+        "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4", "--validation_episodes=2", "--workers=2",
     ]  # fmt: skip
-    process = subprocess.Popen(
-        command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-    )
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.time() + 120
     while len(list((target / ".recording").glob("0*.json"))) < 2 and time.time() < deadline:
         time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGKILL)
+    with pytest.raises(DeskError, match="another process is recording"):
+        record(options(target))
+    os.kill(process.pid, signal.SIGKILL)  # its workers notice and end
     process.wait()
+    time.sleep(1)
     kept = len(list((target / ".recording").glob("0*.json")))
     assert 2 <= kept < 6
     assert not (target / "training").exists()
@@ -114,6 +115,15 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
         assert same(frames(target / split), frames(recording / split))
     with pytest.raises(DeskError, match="already holds a recording"):
         record(options(target))
+
+
+def test_leftovers_of_an_unknown_recording_are_not_adopted(recording, tmp_path):
+    target = tmp_path / "desk"
+    stale = target / ".recording"
+    (stale / "000000").mkdir(parents=True)
+    (stale / "000000.json").write_text('{"task": "turn_on_led", "frames": 1, "attempts": 1}')
+    record(options(target))
+    assert same(frames(target / "training"), frames(recording / "training"))
 
 
 def test_recorded_actions_fulfil_the_task_again_without_noise():

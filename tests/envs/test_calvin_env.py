@@ -126,7 +126,16 @@ def test_actions_of_the_other_control_mode_are_refused_at_once():
     env = CalvinEnv("open_drawer", cameras=(), control_mode="abs")
     env.reset(seed=0)
     with pytest.raises(DeskError, match=r"--env\.control_mode=rel"):
-        env.step([0.3, -0.2, 0.1, 0, 0, 0.4, 1])
+        env.step([0.3, -0.2, 0.9, 0, 0, 0.4, 1])
+    env.close()
+
+
+def test_an_episode_that_ended_cannot_be_stepped_on():
+    env = CalvinEnv("open_drawer", cameras=(), steps_per_command=1)
+    env.reset(seed=0)
+    assert env.step(NOTHING)[2]
+    with pytest.raises(DeskError, match="reset the environment"):
+        env.step(NOTHING)
     env.close()
 
 

@@ -27,6 +27,11 @@ def test_features_follow_the_cameras():
         CalvinEnvConfig(cameras=["wrist"])
 
 
+def test_parallel_tasks_are_refused_because_they_share_a_policy():
+    with pytest.raises(DeskError, match="max_parallel_tasks must be 1"):
+        CalvinEnvConfig(max_parallel_tasks=2)
+
+
 def rollout(use_async: bool):
     config = CalvinEnvConfig(task="open_drawer, turn_on_led", cameras=[], steps_per_command=4)
     envs = make_env(config, n_envs=2, use_async_envs=use_async)
