@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,10 +34,14 @@ EPISODES_PER_TASK = 10
 EVALUATION_SEED = 100_000  # far from the demonstrations' seed: starts that were never recorded
 
 
-def run(title: str, *command: object) -> None:
-    """Runs one of the installed commands in the checkout and stops the quickstart when it fails."""
+def run(title: str, *command: object, log: Path | None = None) -> None:
+    """Runs one of the installed commands in the checkout, with its output in ``log`` if given.
+
+    Raises:
+        QuickstartError: The command failed.
+    """
     words = [str(word) for word in command]
-    print(f"\n=== {title}\n$ {shlex.join(words)}", flush=True)
+    print(f"\n=== {title}{f' (output in {log})' if log else ''}\n$ {shlex.join(words)}", flush=True)
     environment = {
         **os.environ,
         "HF_HUB_OFFLINE": "1",
@@ -44,10 +49,21 @@ def run(title: str, *command: object) -> None:
         "OMP_NUM_THREADS": "1",  # matrices this small gain nothing from a second thread
     }
     started = time.time()
-    code = subprocess.run([str(BIN / words[0]), *words[1:]], cwd=ROOT, env=environment).returncode
-    if code:
-        sys.exit(f"quickstart stopped: `{words[0]}` ended with exit code {code}; its message is above")
+    with open(log or os.devnull, "a") as file:
+        output = file if log else None
+        done = subprocess.run(
+            [str(BIN / words[0]), *words[1:]], cwd=ROOT, env=environment, stdout=output, stderr=output
+        )
+    if done.returncode:
+        raise QuickstartError(
+            f"quickstart stopped: `{words[0]}` ended with exit code {done.returncode}; its message is "
+            f"{f'in {log}' if log else 'above'}"
+        )
     print(f"--- {title}: {time.time() - started:.0f} s", flush=True)
+
+
+class QuickstartError(Exception):
+    """A step failed."""
 
 
 def record_and_convert() -> None:
@@ -77,23 +93,18 @@ def record_and_convert() -> None:
         )
 
 
-def train(name: str, *options: str) -> Path:
+def train(name: str, *options: str, log: Path | None = None) -> Path:
     """Trains with the quickstart's config file; returns the checkpoint."""
     checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
     if not checkpoint.exists():
         shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses a folder that an interrupted run left
         shutil.rmtree(OUT / f"eval_{name}", ignore_errors=True)  # of an earlier checkpoint
-        run(
-            f"train ({name})",
-            "lerobot-train",
-            f"--config_path={CONFIG}",
-            f"--output_dir={OUT / name}",
-            *options,
-        )
+        output_dir = f"--output_dir={OUT / name}"
+        run(f"train ({name})", "lerobot-train", f"--config_path={CONFIG}", output_dir, *options, log=log)
     return checkpoint
 
 
-def evaluate(name: str, checkpoint: Path) -> Path:
+def evaluate(name: str, checkpoint: Path, log: Path | None = None) -> Path:
     """Evaluates every task from unseen starts, with the report."""
     folder = OUT / f"eval_{name}"
     if not (folder / "eval_info.json").exists():
@@ -112,9 +123,18 @@ def evaluate(name: str, checkpoint: Path) -> Path:
             "--eval.batch_size=10",
             f"--seed={EVALUATION_SEED}",
             f"--output_dir={folder}",
+            log=log,
         )
-    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}")
+    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
     return folder
+
+
+def untrained() -> Path:
+    """The same network and statistics with untrained weights: one update with learning rate 0, then evaluated."""
+    log = OUT / "untrained.log"
+    return evaluate(
+        "untrained", train("untrained", "--steps=1", "--policy.learning_rate=0", log=log), log=log
+    )
 
 
 def success(folder: Path) -> dict[str, dict[str, float]]:
@@ -142,13 +162,15 @@ def main() -> None:
     os.chdir(ROOT)
     started = time.time()
     record_and_convert()
-    trained = evaluate("trained", train("trained"))
-    # One update with learning rate 0: the same network and statistics, untrained weights.
-    untrained = evaluate("untrained", train("untrained", "--steps=1", "--policy.learning_rate=0"))
+    OUT.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(1) as other_core:  # training uses one core; the comparison runs beside it
+        comparison = other_core.submit(untrained)
+        trained = evaluate("trained", train("trained"))
+        compared = comparison.result()
     tasks = success(trained)
     summary = {
         "trained": total(tasks),
-        "untrained": total(success(untrained)),
+        "untrained": total(success(compared)),
         "tasks": tasks,
         "minutes": round((time.time() - started) / 60, 1),
     }
@@ -162,4 +184,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except QuickstartError as error:
+        sys.exit(str(error))

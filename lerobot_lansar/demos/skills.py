@@ -81,7 +81,7 @@ def open_drawer(view: View) -> Iterator[Waypoint]:
     x = view.scene.drawer_x + view.rng.uniform(-0.05, 0.05)
     for _ in range(3):
         gap = -0.211 - view.scene_obs[1]
-        yield view.go(x, gap, 0.47 + view.rng.uniform(0, 0.03), tolerance=0.015)
+        yield view.go(x, gap, 0.52 + view.rng.uniform(0, 0.04), tolerance=0.015)
         yield view.go(x, gap, HANDLE_Z, slow=0.8, tolerance=0.01)
         yield view.go(x, gap - 0.24, HANDLE_Z, slow=0.7)
 
@@ -91,7 +91,7 @@ def close_drawer(view: View) -> Iterator[Waypoint]:
     x = view.scene.drawer_x + view.rng.uniform(-0.06, 0.06)
     for _ in range(3):
         front = -0.2612 - view.scene_obs[1]
-        yield view.go(x, front - 0.05, 0.47 + view.rng.uniform(0, 0.03), tolerance=0.02)
+        yield view.go(x, front - 0.05, 0.50 + view.rng.uniform(0, 0.04), tolerance=0.02)
         yield view.go(x, front - 0.05, HANDLE_Z, slow=0.9, tolerance=0.015)
         yield view.go(x, -0.2612 + 0.03, HANDLE_Z, slow=0.7)
 
