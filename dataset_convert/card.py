@@ -46,6 +46,12 @@ def describe(manifest: dict[str, Any], repo_id: str) -> str:
     )
     tasks = sorted({episode["task"] for episode in manifest["episodes"]})
     version = manifest["versions"]["lerobot_policy_lansar"]
+    train, evaluate = "", ""
+    if request["clip"]:
+        clip = request["clip"]
+        train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"
+    else:
+        train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
     return f"""Demonstrations on the CALVIN desk (Mees et al., 2022), one per annotated window, 30 fps.
 
 | feature | shape | content |
@@ -62,12 +68,12 @@ def describe(manifest: dict[str, Any], repo_id: str) -> str:
 * **Privileged state:** `observation.environment_state` is the simulator's own state (block poses, joints,
   lights). A real robot does not have it; results of policies that read it must say so.
 
-Train and evaluate with LeRobot (`pip install lerobot_policy_lansar` brings the policy and the environment):
+Train and evaluate with LeRobot, the plugin lerobot_policy_lansar installed beside it:
 
-    lerobot-train --policy.type=lansar --dataset.repo_id={repo_id} --policy.push_to_hub=false \\
+    lerobot-train --policy.type=lansar{train} --dataset.repo_id={repo_id} \\
         --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
-        --env.control_mode=abs
+        --env.control_mode=abs{evaluate}
 
 LanSAR emits absolute poses by default; a policy that emits what `action` holds is evaluated with
 `--env.control_mode={request["action"]}`.

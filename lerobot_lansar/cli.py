@@ -13,8 +13,8 @@ HELP = """usage: lerobot COMMAND [key=value ...] [--option=value ...]
 
 Runs LeRobot's own lerobot-COMMAND: key=value becomes --key=value, and what starts with - is passed on.
 
-    lerobot train policy=lansar dataset.repo_id=you/desk_D steps=3000
-    lerobot eval policy=outputs/train/checkpoints/last/pretrained_model env=calvin seed=0
+    lerobot train policy=lansar dataset.repo_id=you/desk_D policy.use_images=false steps=3000
+    lerobot eval policy=outputs/train/checkpoints/last/pretrained_model env=calvin env.control_mode=abs seed=0
 
 policy=NAME is --policy.type=NAME; policy=FOLDER or policy=user/model is --policy.path=…;
 env=NAME is --env.type=NAME. lerobot COMMAND --help lists a command's options.
