@@ -92,6 +92,7 @@ def main(options: Options) -> None:
             f"{row['policy_ms']:>6.1f} ms {row['total_ms']:>6.1f} ms {row['ms_per_environment']:>6.1f} ms"
         )
     if options.output:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
         settings = {k: v for k, v in asdict(options).items() if k != "output"}
         options.output.write_text(json.dumps({"settings": settings, "rows": rows}, indent=2) + "\n")
 

@@ -131,6 +131,7 @@ def main(options: Options) -> None:
     for name, value in row.items():
         print(f"{name:>24}  {value if isinstance(value, str | int) else round(value, 4)}")
     if options.output:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
         settings = {
             k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items() if k != "output"
         }

@@ -1,8 +1,12 @@
 """The distribution: LeRobot must find it, and importing it must stay cheap."""
 
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points, metadata
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_distribution_name_is_the_one_lerobot_looks_for():
@@ -39,3 +43,26 @@ def test_lerobots_own_discovery_registers_policy_and_environment():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("True True")
+
+
+def test_every_file_that_the_documentation_names_exists():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "Makefile", *(ROOT / "docs").glob("*.md")]
+    pages += (ROOT / "scripts").iterdir()
+    named = {
+        (page.name, path)
+        for page in pages
+        if page.is_file()
+        for path in re.findall(r"(?<![\w/])(?:configs|docs|benchmarks|scripts|tests)/[\w./]*\.\w+", page.read_text())
+    }
+    assert len(named) > 10
+    assert [entry for entry in sorted(named) if not (ROOT / entry[1]).exists()] == []
+
+
+def test_the_small_preset_is_the_policy_of_the_quickstart():
+    import yaml
+
+    small, quickstart = (
+        yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text())["policy"]
+        for name in ("lansar_small", "quickstart")
+    )
+    assert small == quickstart
