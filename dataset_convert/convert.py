@@ -226,8 +226,8 @@ def _run(job: _Job, workers: int) -> list[dict]:
         # Forked workers need not import LeRobot again (20 s and 0.5 GB each).
         methods = multiprocessing.get_all_start_methods()
         context = multiprocessing.get_context("fork" if "fork" in methods else "spawn")
-        done = context.Value("q", 0)
-        with ProcessPoolExecutor(workers, context, _start_worker, (job, done, os.getpid())) as pool:
+        done, stop = context.Value("q", 0), context.Event()
+        with ProcessPoolExecutor(workers, context, _start_worker, (job, done, stop, os.getpid())) as pool:
             futures = [pool.submit(_write_in_worker, shard) for shard in shards]
             try:
                 while wait(futures, timeout=0.5, return_when=FIRST_EXCEPTION).not_done:
@@ -238,16 +238,17 @@ def _run(job: _Job, workers: int) -> list[dict]:
                 bar.update(done.value - bar.n)
                 return [future.result() for future in futures]
             except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
+                stop.set()
+                pool.shutdown(cancel_futures=True)  # nobody writes while the folder is removed
                 raise
 
 
-_worker: tuple[_Job, Any] | None = None
+_worker: tuple[_Job, Any, Any] | None = None
 
 
-def _start_worker(job: _Job, done: Any, parent: int) -> None:
+def _start_worker(job: _Job, done: Any, stop: Any, parent: int) -> None:
     global _worker
-    _worker = job, done
+    _worker = job, done, stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
 
     def follow_parent() -> None:  # a killed parent must not leave writers behind
@@ -260,9 +261,11 @@ def _start_worker(job: _Job, done: Any, parent: int) -> None:
 
 def _write_in_worker(shard: int) -> dict:
     assert _worker is not None
-    job, done = _worker
+    job, done, stop = _worker
 
     def count() -> None:
+        if stop.is_set():
+            raise RuntimeError("stopped because another worker failed")
         with done.get_lock():
             done.value += 1
 

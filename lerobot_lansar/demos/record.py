@@ -177,7 +177,7 @@ def _done(config: RecordConfig, missing: list[int]) -> Iterator[None]:
             for future in as_completed(futures):
                 yield future.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)  # nobody writes after the lock is gone
             raise
 
 

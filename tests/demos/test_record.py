@@ -94,17 +94,22 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
         sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", "--seed=3", "--cameras=[]",
         "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4", "--validation_episodes=2", "--workers=2",
     ]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
+    )
     deadline = time.time() + 120
-    while len(list((target / ".recording").glob("0*.json"))) < 2 and time.time() < deadline:
-        time.sleep(0.02)
+    while not list((target / ".recording").glob("0*.json")) and time.time() < deadline:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGSTOP)
+    assert 1 <= len(list((target / ".recording").glob("0*.json"))) < 6
     with pytest.raises(DeskError, match="another process is recording"):
         record(options(target))
-    os.kill(process.pid, signal.SIGKILL)  # its workers notice and end
+    process.kill()
     process.wait()
-    time.sleep(1)
-    kept = len(list((target / ".recording").glob("0*.json")))
-    assert 2 <= kept < 6
+    os.killpg(process.pid, signal.SIGCONT)
+    while _alive(process.pid) and time.time() < deadline:  # the workers notice and end
+        time.sleep(0.05)
+    assert not _alive(process.pid)
     assert not (target / "training").exists()
     with pytest.raises(DeskError, match="begun with other options"):
         record(options(target, seed=4))
@@ -115,6 +120,14 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
         assert same(frames(target / split), frames(recording / split))
     with pytest.raises(DeskError, match="already holds a recording"):
         record(options(target))
+
+
+def _alive(group):
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def test_leftovers_of_an_unknown_recording_are_not_adopted(recording, tmp_path):
