@@ -30,6 +30,7 @@ TASKS = [
     "turn_off_led",
     "lift_red_block_table",
 ]
+HARD = ["open_drawer", "lift_red_block_table"]  # get twice as many demonstrations as the others
 EPISODES_PER_TASK = 10
 EVALUATION_SEED = 100_000  # far from the demonstrations' seed: starts that were never recorded
 
@@ -73,9 +74,9 @@ def record_and_convert() -> None:
             "record demonstrations",
             "lansar-record",
             "--scene=D",
-            f"--tasks=[{','.join(TASKS)}]",
-            "--episodes=1080",
-            "--validation_episodes=45",
+            f"--tasks=[{','.join(TASKS + HARD)}]",
+            "--episodes=1320",
+            "--validation_episodes=55",
             "--cameras=[]",
             "--seed=0",
             "--workers=2",
