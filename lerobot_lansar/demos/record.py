@@ -46,6 +46,8 @@ class RecordConfig:
     noise: float = 0.2
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
+    # Who draws the pictures: fast, fast_gl (the look of CALVIN's public data), tiny or egl.
+    renderer: str = "fast"
     # YAML of sentences by task; our own by default.
     annotations: str | None = None
     workers: int = 1
@@ -136,7 +138,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _look(config: RecordConfig) -> tuple[Scene, str]:
     """The scene and the kind of assets; fails early when scene, assets or cameras are not to be had."""
-    with Desk(config.scene, config.assets, config.cameras) as desk:
+    with Desk(config.scene, config.assets, config.cameras, config.renderer) as desk:
         return desk.scene, desk.assets
 
 
@@ -196,7 +198,7 @@ def _start_worker(config: RecordConfig, parent: int) -> None:
 
 def _open_desk(config: RecordConfig) -> None:
     global _worker
-    _worker = (config, Desk(config.scene, config.assets, cameras=config.cameras))
+    _worker = (config, Desk(config.scene, config.assets, config.cameras, config.renderer))
 
 
 def _record_one(index: int) -> None:

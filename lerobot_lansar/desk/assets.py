@@ -18,6 +18,7 @@ class Assets:
     Attributes:
         kind: ``"built-in"`` or ``"original"``; every results file states it.
         scale: Global scaling to load the desk and the blocks with.
+        temporary: The files go away once they are loaded.
     """
 
     kind: str
@@ -26,6 +27,7 @@ class Assets:
     plane: Path
     blocks: dict[str, Path]
     scale: float
+    temporary: bool
 
 
 @contextmanager
@@ -41,7 +43,9 @@ def open_assets(scene: Scene, folder: str | Path | None) -> Iterator[Assets]:
     with tempfile.TemporaryDirectory(prefix="lansar_desk_") as name:
         path = Path(name)
         files = builtin.write(scene, path)
-        yield Assets("built-in", path / "robot.urdf", path / "desk.urdf", path / "plane.urdf", files, 1.0)
+        yield Assets(
+            "built-in", path / "robot.urdf", path / "desk.urdf", path / "plane.urdf", files, 1.0, True
+        )
 
 
 def _original(scene: Scene, folder: Path) -> Assets:
@@ -52,6 +56,7 @@ def _original(scene: Scene, folder: Path) -> Assets:
         plane=folder / "plane" / "plane.urdf",
         blocks={c: folder / "blocks" / f"block_{c}_{size}.urdf" for c, size in scene.blocks.items()},
         scale=0.8,
+        temporary=False,
     )
     for file in (assets.robot, assets.desk, assets.plane, *assets.blocks.values()):
         if not file.is_file():

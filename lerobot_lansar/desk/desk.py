@@ -9,10 +9,11 @@ import numpy as np
 import pybullet as p
 
 from .assets import Assets, open_assets
-from .cameras import CAMERAS, gripper_view, static_view, take_picture
+from .cameras import CAMERAS, gripper_view, static_view
 from .errors import DeskError, SimulationError
 from .furniture import Table, load_blocks
 from .oracle import BlockState, Snapshot, Touch, completed_tasks
+from .render import RENDERERS, Preparation, Renderer
 from .robot import Robot
 from .scenes import COLORS, Scene, get_scene
 
@@ -37,9 +38,12 @@ class Desk:
         scene: ``"A"``, ``"B"``, ``"C"`` or ``"D"``.
         assets: None for the built-in desk, or the ``data`` folder of a calvin_env checkout for the original files.
         cameras: Pictures that observations hold: any of ``"static"`` (200x200) and ``"gripper"`` (84x84).
+        renderer: ``"fast"`` (ours, in TinyRenderer's look), ``"fast_gl"`` (ours, in the OpenGL look of CALVIN's public
+            data), ``"tiny"`` or ``"egl"`` (PyBullet's own). It is set up when the first picture is asked for.
+        depth: Observations also hold ``depth_<camera>``.
 
     Raises:
-        DeskError: Unknown scene or camera, missing asset files.
+        DeskError: Unknown scene, camera or renderer, missing asset files, no driver for ``egl``.
     """
 
     def __init__(
@@ -47,10 +51,17 @@ class Desk:
         scene: str = "D",
         assets: str | Path | None = None,
         cameras: Sequence[str] = ("static", "gripper"),
+        renderer: str = "fast",
+        depth: bool = False,
     ):
         _check_cameras(cameras)
+        if renderer not in RENDERERS:
+            raise DeskError(f"renderer {renderer!r} is unknown; choose among {', '.join(RENDERERS)}")
         self.scene: Scene = get_scene(scene)
         self.cameras = tuple(cameras)
+        self.renderer = renderer
+        self.depth = depth
+        self._renderer: Renderer | None = None
         self._client = -1
         with open_assets(self.scene, assets) as files:
             self.assets = files.kind
@@ -65,6 +76,7 @@ class Desk:
 
     def _load(self, files: Assets) -> None:
         client = self._client
+        self._pictures = Preparation(self.renderer, client)
         p.setGravity(0, 0, -9.8, physicsClientId=client)
         self._robot = Robot(client, files)
         self._blocks = load_blocks(client, files, self.scene)
@@ -75,6 +87,7 @@ class Desk:
         self._names = {self._robot.body: "robot", self._table.body: "desk", plane: "plane"}
         self._names |= {block.body: color for color, block in self._blocks.items()}
         self._desk_links = {index: name for name, index in self._table.links.items()}
+        self._pictures.loaded(files.temporary)
 
     # ---- what users call
 
@@ -128,7 +141,9 @@ class Desk:
         return self.observe()
 
     def observe(self) -> Observation:
-        """``robot_obs``, ``scene_obs`` and a picture ``rgb_<camera>`` (uint8) per camera."""
+        """The present state: ``robot_obs``, ``scene_obs`` and, per camera, ``rgb_<camera>`` (size, size, 3) uint8 and,
+        if the desk was made with ``depth``, ``depth_<camera>`` (size, size) float32 m.
+        """
         self._require_open()
         obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
         if not all(np.isfinite(state).all() for state in obs.values()):
@@ -136,16 +151,18 @@ class Desk:
                 "the simulation diverged: a state is no longer finite; reset the desk to go on"
             )
         for camera in self.cameras:
-            obs[f"rgb_{camera}"] = self.render(camera)
+            obs[f"rgb_{camera}"], inverse = self._draw(camera)
+            if self.depth:
+                obs[f"depth_{camera}"] = _distance(camera, inverse)
         return obs
 
     def render(self, camera: str = "static", size: int | None = None) -> np.ndarray:
         """A picture of the present state, (size, size, 3) uint8; ``size`` in pixels, the camera's own by default."""
-        self._require_open()
-        _check_cameras((camera,))
-        self._table.show_lights()
-        view = static_view() if camera == "static" else gripper_view(*self._robot.camera_pose())
-        return take_picture(self._client, CAMERAS[camera], view, size)
+        return self._draw(camera, size)[0]
+
+    def render_depth(self, camera: str = "static", size: int | None = None) -> np.ndarray:
+        """Distance along the camera's axis, (size, size) float32 m; the camera's far plane where there is nothing."""
+        return _distance(camera, self._draw(camera, size)[1])
 
     def snapshot(self) -> Snapshot:
         """What the task oracle needs of the present state."""
@@ -198,6 +215,17 @@ class Desk:
     def _require_open(self) -> None:
         if self._client < 0:
             raise DeskError("this desk is closed, or Bullet had no client left for it; make a new one")
+
+    def _draw(self, camera: str, size: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """A picture and 1 / distance."""
+        self._require_open()
+        _check_cameras((camera,))
+        if self._renderer is None:
+            self._renderer = self._pictures.open(self._table.light_colors())
+        still = camera == "static"
+        view = static_view() if still else gripper_view(*self._robot.camera_pose())
+        lens = CAMERAS[camera]
+        return self._renderer.draw(lens, view, size or lens.size, self._table.light_colors(), keep=still)
 
     def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
         self._table.reset(scene_state[:6])
@@ -253,6 +281,11 @@ def _check_cameras(cameras: Sequence[str]) -> None:
     for camera in cameras:
         if camera not in CAMERAS:
             raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+
+
+def _distance(camera: str, inverse: np.ndarray) -> np.ndarray:
+    far = np.float32(CAMERAS[camera].far)
+    return 1 / np.maximum(inverse, 1 / far)
 
 
 def _vector(values: Any, length: int, name: str) -> np.ndarray:

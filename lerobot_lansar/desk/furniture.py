@@ -47,7 +47,6 @@ class Table:
             physicsClientId=client,
         )
         self.bulb = self.led = False
-        self._shown = {"led": False, "bulb": False}
         self._was_pressed = self._was_on = False
 
     def joints(self) -> list[float]:
@@ -74,16 +73,12 @@ class Table:
             self.bulb = on
         self._was_on = on
 
-    def show_lights(self) -> None:
-        """Paints the lights in their present state; needed before a picture only."""
-        for name, link, lit, color in (
-            ("led", "led_link", self.led, LED_ON),
-            ("bulb", "light_link", self.bulb, BULB_ON),
-        ):
-            if lit != self._shown[name]:
-                rgba = color if lit else OFF
-                p.changeVisualShape(self.body, self.links[link], rgbaColor=rgba, physicsClientId=self.client)
-                self._shown[name] = lit
+    def light_colors(self) -> dict[tuple[int, int], tuple[float, ...]]:
+        """rgba of LED and bulb as they are now, by (body, link)."""
+        return {
+            (self.body, self.links["led_link"]): LED_ON if self.led else OFF,
+            (self.body, self.links["light_link"]): BULB_ON if self.bulb else OFF,
+        }
 
     def observe(self) -> np.ndarray:
         """The first six numbers of ``scene_obs``: (6,) float64."""

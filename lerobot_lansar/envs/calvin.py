@@ -15,6 +15,7 @@ from ..desk import CONTROL_HZ, TASKS, Desk, DeskError
 from ..desk.cameras import CAMERAS
 from ..desk.commands import load_commands
 from ..desk.oracle import Snapshot
+from ..desk.render import RENDERERS
 from ..desk.starts import sample_start
 from .benchmark import CHAIN_LENGTH, load_chains
 
@@ -62,6 +63,8 @@ class CalvinEnv(gym.Env):
         steps_per_command: Control steps that a command may take.
         annotations: YAML file of sentences by task (CALVIN's format); our own by default.
         results_dir: If given, every finished episode is appended to ``episodes-<process id>.jsonl`` in it.
+        renderer: ``"fast"``, ``"fast_gl"`` (the look of CALVIN's public data), ``"tiny"`` or ``"egl"``; see
+            :class:`~lerobot_lansar.desk.Desk`.
         render_fps: How often ``render`` draws a new picture; in between it returns the last one again.
         render_mode: ``"rgb_array"``, the static camera's picture.
 
@@ -80,6 +83,7 @@ class CalvinEnv(gym.Env):
         steps_per_command: int = 360,
         annotations: str | None = None,
         results_dir: str | None = None,
+        renderer: str = "fast",
         render_fps: int = CONTROL_HZ,
         render_mode: str | None = "rgb_array",
     ):
@@ -97,7 +101,14 @@ class CalvinEnv(gym.Env):
         self.control_mode = control_mode
         self.steps_per_command = steps_per_command
         self.render_mode = render_mode
-        self._desk_options = {"scene": scene, "assets": assets, "cameras": tuple(cameras)}
+        if renderer not in RENDERERS:
+            raise DeskError(f"renderer {renderer!r} is unknown; choose among {', '.join(RENDERERS)}")
+        self._desk_options = {
+            "scene": scene,
+            "assets": assets,
+            "cameras": tuple(cameras),
+            "renderer": renderer,
+        }
         self._sentences = load_commands(annotations)
         self._results_dir = None if results_dir is None else Path(results_dir)
         self._redraw_every = max(1, round(CONTROL_HZ / render_fps))
@@ -243,7 +254,7 @@ class CalvinEnv(gym.Env):
             "commands": self._done,
             "successes": sum(command["success"] for command in self._done),
             "assets": self._desk.assets,
-            "renderer": "tiny" if self._desk.cameras else None,
+            "renderer": self._desk.renderer if self._desk.cameras else None,
             "control_mode": self.control_mode,
             "steps_per_command": self.steps_per_command,
             "version": version("lerobot_policy_lansar"),

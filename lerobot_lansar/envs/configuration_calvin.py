@@ -33,6 +33,7 @@ class CalvinEnvConfig(EnvConfig):
     steps_per_command: int = 360
     annotations: str | None = None
     results_dir: str | None = None
+    renderer: str = "fast"
     render_fps: int = 30
 
     def __post_init__(self) -> None:
@@ -70,6 +71,7 @@ class CalvinEnvConfig(EnvConfig):
             "steps_per_command",
             "annotations",
             "results_dir",
+            "renderer",
         )
         return {name: getattr(self, name) for name in names} | {"render_fps": self.render_fps}
 

@@ -146,7 +146,7 @@ def test_errors_name_what_is_wrong(tmp_path, desk):
         desk.step(ZERO)
 
 
-def test_a_camera_without_numpy_says_how_to_repair_it(monkeypatch, desk):
-    monkeypatch.setattr("lerobot_lansar.desk.cameras.p.isNumpyEnabled", lambda: 0)
-    with pytest.raises(DeskError, match="make install"):
+def test_a_camera_without_numpy_says_how_to_repair_it(monkeypatch):
+    monkeypatch.setattr("pybullet.isNumpyEnabled", lambda: 0)
+    with Desk("D", cameras=(), renderer="tiny") as desk, pytest.raises(DeskError, match="make install"):
         desk.render("static")

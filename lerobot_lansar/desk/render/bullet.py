@@ -1,0 +1,75 @@
+"""PyBullet's own two renderers: the reference for ours, and slower."""
+
+import importlib.util
+from typing import Any
+
+import numpy as np
+import pybullet as p
+
+from ..cameras import Camera
+from ..errors import DeskError
+
+Colors = dict[tuple[int, int], tuple[float, ...]]
+
+
+class BulletRenderer:
+    """Draws with ``getCameraImage``.
+
+    Args:
+        client: Bullet client.
+        plugin: The EGL plugin's id in this client (:func:`load_egl`), or None for TinyRenderer.
+
+    Raises:
+        DeskError: This pybullet was built without numpy.
+    """
+
+    def __init__(self, client: int, plugin: int | None = None):
+        if not p.isNumpyEnabled():
+            raise DeskError(
+                "this pybullet was built without numpy, so its cameras return Python tuples and are many times "
+                "slower. Reinstall it with numpy present: `make install` in this package's checkout, or "
+                "`pip install numpy setuptools wheel && pip install --no-build-isolation --no-binary pybullet "
+                "--force-reinstall --no-cache-dir pybullet==3.2.7`"
+            )
+        self._client = client
+        self._renderer = p.ER_TINY_RENDERER if plugin is None else p.ER_BULLET_HARDWARE_OPENGL
+        self._shown: Colors = {}
+        if plugin is not None:  # the plugin's first picture has no shadow
+            self.draw(Camera(16, 60.0, 0.1, 10.0), np.eye(4), 16, {})
+
+    def draw(
+        self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`.fast.FastRenderer.draw`."""
+        for (body, link), color in colors.items():
+            if self._shown.get((body, link)) != color:
+                p.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
+                self._shown[body, link] = color
+        near, far = camera.near, camera.far
+        image: Any = p.getCameraImage(
+            size,
+            size,
+            view.T.ravel().tolist(),
+            p.computeProjectionMatrixFOV(camera.fov, 1.0, near, far),
+            renderer=self._renderer,
+            physicsClientId=self._client,
+        )
+        picture = np.asarray(image[2], np.uint8).reshape(size, size, 4)[..., :3]
+        buffer = np.asarray(image[3], np.float64).reshape(size, size)
+        return picture, ((far - (far - near) * buffer) / (far * near)).astype(np.float32)
+
+
+def load_egl(client: int) -> int:
+    """Loads the EGL plugin, which must happen before anything is loaded into the client; returns its id.
+
+    Raises:
+        DeskError: The plugin, EGL or a driver for it is missing.
+    """
+    found = importlib.util.find_spec("eglRenderer")
+    plugin = p.loadPlugin(found.origin, "_eglRendererPlugin", physicsClientId=client) if found else -1
+    if plugin < 0:
+        raise DeskError(
+            "renderer egl: pybullet's EGL plugin could not be loaded; it needs an OpenGL driver with EGL (Debian and "
+            "Ubuntu: libegl1 and a GPU driver or libgl1-mesa-dri). Renderer fast_gl draws the same look without one"
+        )
+    return plugin

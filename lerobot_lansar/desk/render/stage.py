@@ -1,0 +1,82 @@
+"""What there is to draw in a Bullet client, and where it is now."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pybullet as p
+
+from .kinematics import Links
+from .visuals import Visual, transform
+
+
+@dataclass(frozen=True)
+class Group:
+    """The visuals of one link, which move together.
+
+    Attributes:
+        still: They never move and never change their colour.
+    """
+
+    body: int
+    link: int
+    visuals: list[Visual]
+    still: bool
+
+
+class Stage:
+    """Groups of visuals and their poses.
+
+    Args:
+        client: Bullet client.
+        visuals: All its visuals, in Bullet's order.
+        repainted: (body, link) whose colours change.
+    """
+
+    def __init__(self, client: int, visuals: Sequence[Visual], repainted: Collection[tuple[int, int]]):
+        self._client = client
+        bodies = list(dict.fromkeys(visual.body for visual in visuals))
+        self._jointed = {
+            body: Links(client, body) for body in bodies if p.getNumJoints(body, physicsClientId=client)
+        }
+        self._inertial = {body: p.getDynamicsInfo(body, -1, physicsClientId=client) for body in bodies}
+        self._free = [b for b in bodies if b not in self._jointed and self._inertial[b][0] > 0]
+        keys = list(dict.fromkeys((visual.body, visual.link) for visual in visuals))
+        self.groups = [
+            Group(
+                body,
+                link,
+                [visual for visual in visuals if (visual.body, visual.link) == (body, link)],
+                (body, link) not in repainted and not self._moves(body, link),
+            )
+            for body, link in keys
+        ]
+        self._poses = np.array([self._base(group.body) for group in self.groups])
+        self._rows = {
+            body: [(row, group.link) for row, group in enumerate(self.groups) if group.body == body]
+            for body in (*self._jointed, *self._free)
+        }
+
+    def poses(self) -> np.ndarray:
+        """URDF frame of every group's link in world coordinates, (groups, 4, 4); the array is used again."""
+        for body, links in self._jointed.items():
+            states = p.getJointStates(body, links.moving, physicsClientId=self._client)
+            frames = links.poses([state[0] for state in states])
+            for row, link in self._rows[body]:
+                self._poses[row] = frames[link + 1]
+        for body in self._free:
+            frame = self._base(body)
+            for row, _ in self._rows[body]:
+                self._poses[row] = frame
+        return self._poses
+
+    def _moves(self, body: int, link: int) -> bool:
+        return body in self._free or (body in self._jointed and self._jointed[body].moves(link))
+
+    def _base(self, body: int) -> np.ndarray:
+        position, orientation = p.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        _, _, _, local_position, local_orientation = self._inertial[body][:5]
+        if any(local_position) or local_orientation != (0.0, 0.0, 0.0, 1.0):
+            inverse = p.invertTransform(local_position, local_orientation)
+            position, orientation = p.multiplyTransforms(position, orientation, *inverse)
+        return transform(position, orientation)
