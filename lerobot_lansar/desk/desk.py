@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,17 @@ SUBSTEPS = 8
 Observation = dict[str, np.ndarray]
 
 _PARKING = 100.0  # where blocks wait while contact caches are cleared (m)
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """How a desk came to where it was: the state it was reset to and the actions since. It can be pickled."""
+
+    scene: str
+    assets: str
+    robot_obs: np.ndarray | None
+    scene_obs: np.ndarray
+    actions: tuple[tuple[np.ndarray, str], ...]
 
 
 class Desk:
@@ -62,6 +74,7 @@ class Desk:
         self.renderer = renderer
         self.depth = depth
         self._renderer: Renderer | None = None
+        self._actions: list[tuple[np.ndarray, str]] = []
         self._client = -1
         with open_assets(self.scene, assets) as files:
             self.assets = files.kind
@@ -116,6 +129,8 @@ class Desk:
         scene_state = self._random_scene(seed) if scene_obs is None else _vector(scene_obs, 24, "scene_obs")
         self._clear_contacts()
         self._put(robot_state, scene_state)
+        self._history = SavedState(self.scene.name, self.assets, robot_state, scene_state, ())
+        self._actions = []
         return self.observe()
 
     def step(self, action: Sequence[float] | np.ndarray, control_mode: str = "rel") -> Observation:
@@ -134,10 +149,31 @@ class Desk:
         self._require_open()
         if control_mode not in ("rel", "abs"):
             raise DeskError(f"control_mode {control_mode!r} is unknown; it is 'rel' or 'abs'")
-        self._robot.command(_vector(action, 7, "action"), relative=control_mode == "rel")
-        for _ in range(SUBSTEPS):
-            p.stepSimulation(physicsClientId=self._client)
-        self._table.update_lights()
+        self._advance(_vector(action, 7, "action"), control_mode)
+        return self.observe()
+
+    def save(self) -> SavedState:
+        """Remembers the present state for :meth:`restore`, here or on another desk of the same scene and assets."""
+        self._require_open()
+        return replace(self._history, actions=tuple(self._actions))
+
+    def restore(self, state: SavedState) -> Observation:
+        """Goes back to a saved state; the same actions then lead to the same states, bit for bit.
+
+        Bullet's own saved states miss what its contact solver remembers, so this resets and repeats the actions: about
+        1 ms for each.
+
+        Raises:
+            DeskError: The state belongs to another scene or to other assets.
+        """
+        if (state.scene, state.assets) != (self.scene.name, self.assets):
+            raise DeskError(
+                f"the state was saved in scene {state.scene} with {state.assets} assets; this desk is scene "
+                f"{self.scene.name} with {self.assets} assets"
+            )
+        self.reset(state.robot_obs, state.scene_obs)
+        for action, control_mode in state.actions:
+            self._advance(action, control_mode)
         return self.observe()
 
     def observe(self) -> Observation:
@@ -226,6 +262,13 @@ class Desk:
         view = static_view() if still else gripper_view(*self._robot.camera_pose())
         lens = CAMERAS[camera]
         return self._renderer.draw(lens, view, size or lens.size, self._table.light_colors(), keep=still)
+
+    def _advance(self, action: np.ndarray, control_mode: str) -> None:
+        self._actions.append((action, control_mode))
+        self._robot.command(action, relative=control_mode == "rel")
+        for _ in range(SUBSTEPS):
+            p.stepSimulation(physicsClientId=self._client)
+        self._table.update_lights()
 
     def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
         self._table.reset(scene_state[:6])

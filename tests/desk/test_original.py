@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +10,21 @@ from PIL import Image
 
 from lerobot_lansar.desk import COLORS, SCENES, TASKS, BlockState, Desk, Snapshot, completed_tasks
 
-TRAJECTORIES = [
-    "button_A", "drawer_C", "eval_000", "eval_022", "lift_red_A", "lift_red_B", "place_red_slider_D", "rand_A_rel_hi",
-    "rand_B_abs_hi", "rotate_blue_D", "slider_C", "stack_red_D", "switch_B",
-]  # fmt: skip
+EXCEPTION = "slider_A"
+"""The one recording of 68 that is not repeated bit for bit: from its 173rd frame on, pushing the slide, joints differ by
+up to 0.008 rad. What was simulated before the reset decides (without our clearing step it parts at frame 177 instead),
+and what the original's fresh environment simulated at random before its first reset is not recorded."""
+
+TOLERANCE = 2
+"""Frames by which a task may be fulfilled earlier or later than in ``dynamics``, which was recorded without
+deterministic pairs: there the motion in contact depends on the environment's seed (surprise 1 of its README)."""
+
+OTHER_OUTCOMES = {
+    # The block moved 0.09993 m instead of 0.10005; the task asks for 0.1.
+    ("eval_013", 107): {"push_red_block_right"},
+    # A block rotated in passing, which no command asked for.
+    ("eval_014", 219): {"rotate_pink_block_left"},
+}
 
 
 def red_blue_pink(scene: str) -> list[int]:
@@ -21,17 +33,51 @@ def red_blue_pink(scene: str) -> list[int]:
     return list(range(6)) + [6 + 6 * order.index(c) + i for c in COLORS for i in range(6)]
 
 
-@pytest.mark.parametrize("name", TRAJECTORIES)
-def test_trajectories_equal_the_original_bit_for_bit(golden, original_assets, name):
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "golden" / "dynamics"
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in RECORDINGS.glob("*.npz")) or ["absent"])
+def test_trajectories_and_their_tasks_are_the_originals(golden, original_assets, name):
     recorded = np.load(golden / "dynamics" / f"{name}.npz")
     expected = np.load(golden / "dynamics_det" / f"{name}.npz")
+    events = json.loads((golden / "events.json").read_text())[name]
     scene = str(recorded["scene"])[-1]
     columns = red_blue_pink(scene)
     with Desk(scene, original_assets, cameras=()) as desk:
         obs = [desk.reset(recorded["reset_robot_obs"], recorded["reset_scene_obs"][columns])]
-        obs += [desk.step(action, str(recorded["mode"])) for action in recorded["actions"]]
-    np.testing.assert_array_equal([o["robot_obs"] for o in obs], expected["robot_obs"])
-    np.testing.assert_array_equal([o["scene_obs"] for o in obs], expected["scene_obs"][:, columns])
+        states = [desk.snapshot()]
+        for action in recorded["actions"]:
+            obs.append(desk.step(action, str(recorded["mode"])))
+            states.append(desk.snapshot())
+    bound = 0.01 if name == EXCEPTION else 0.0
+    for key, row in (("robot_obs", slice(None)), ("scene_obs", columns)):
+        difference = np.abs(np.array([o[key] for o in obs]) - expected[key][:, row])
+        assert difference.max() <= bound
+    for segment in events:
+        if "segment" not in segment:
+            continue
+        start, first = segment["start"], {}
+        for frame in range(start + 1, segment["end"] + 1):
+            for task in completed_tasks(states[start], states[frame]):
+                first.setdefault(task, frame)
+        missing = set(segment["first_success"]) ^ set(first)
+        assert missing <= OTHER_OUTCOMES.get((name, start), set())
+        for task in first.keys() - missing:
+            assert abs(first[task] - segment["first_success"][task]) <= TOLERANCE
+
+
+def test_all_initial_states_are_reached(golden, original_assets):
+    states = np.load(golden / "initial_states.npz")
+    with Desk("D", original_assets, cameras=()) as desk:
+        for robot_obs, scene_obs in zip(states["robot_obs"], states["scene_obs"], strict=True):
+            obs = desk.reset(robot_obs, scene_obs)
+            np.testing.assert_allclose(obs["robot_obs"][7:14], robot_obs[7:14], atol=2e-3)
+            np.testing.assert_allclose(obs["scene_obs"][:6], scene_obs[:6], atol=2e-3)
+            blocks, asked = (state[6:].reshape(3, 6) for state in (obs["scene_obs"], scene_obs))
+            # one simulation step tilts a block by up to 3e-3 rad
+            np.testing.assert_allclose(blocks[:, :3], asked[:, :3], atol=2e-3)
+            turned = (blocks[:, 3:] - asked[:, 3:] + np.pi) % (2 * np.pi) - np.pi
+            assert np.abs(turned).max() < 5e-3
 
 
 def _snapshot(info: dict) -> Snapshot:
@@ -84,15 +130,21 @@ def test_tasks_are_calvins_in_calvins_order(golden):
     assert list(TASKS) == [task["task"] for task in json.loads((golden / "tasks.json").read_text())]
 
 
-@pytest.mark.parametrize("tag", ["A_1_on", "B_0_off", "C_1_off", "D_0_on"])
-def test_pictures_equal_the_originals(golden, original_assets, tag):
+TAGS = [f"{scene}_{state}" for scene in "ABCD" for state in ("0_on", "0_off", "1_on", "1_off")]
+
+
+@pytest.mark.parametrize("renderer", ["tiny", "fast"])
+@pytest.mark.parametrize("tag", TAGS)
+def test_pictures_equal_the_originals(golden, original_assets, tag, renderer):
     states = json.loads((golden / "images" / "states.json").read_text())
     state = next(s for s in states if s["tag"] == tag)
     scene_obs = np.array(state["reset_scene_obs"])[red_blue_pink(tag[0])]
-    with Desk(tag[0], original_assets) as desk:
+    depths = np.load(golden / "images" / "images.npz")
+    with Desk(tag[0], original_assets, renderer=renderer, depth=True) as desk:
         obs = desk.reset(state["reset_robot_obs"], scene_obs)
     for camera in ("static", "gripper"):
-        expected = np.asarray(Image.open(golden / "images" / f"{tag}_{camera}.png").convert("RGB")).astype(
-            int
-        )
-        assert np.abs(obs[f"rgb_{camera}"] - expected).mean() < 0.02, camera
+        picture = Image.open(golden / "images" / f"{tag}_{camera}.png").convert("RGB")
+        assert np.abs(obs[f"rgb_{camera}"] - np.asarray(picture).astype(int)).mean() < 0.02, camera
+        difference = np.abs(obs[f"depth_{camera}"] - depths[f"{tag}_depth_{camera}"])
+        # a pixel on an edge may show what is behind it
+        assert (difference > 1e-3).mean() < 1e-3, camera

@@ -34,8 +34,9 @@ class BulletRenderer:
         self._client = client
         self._renderer = p.ER_TINY_RENDERER if plugin is None else p.ER_BULLET_HARDWARE_OPENGL
         self._shown: Colors = {}
-        if plugin is not None:  # the plugin's first picture has no shadow
-            self.draw(Camera(16, 60.0, 0.1, 10.0), np.eye(4), 16, {})
+        if plugin is not None:  # the plugin's first two pictures have no shadow
+            for _ in range(2):
+                self.draw(Camera(16, 60.0, 0.1, 10.0), np.eye(4), 16, {})
 
     def draw(
         self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False

@@ -1,5 +1,6 @@
 """What the bodies of a Bullet client look like: triangles, colours and textures, read once after loading."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -133,11 +134,13 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):
 
 def _load_obj(path: Path) -> Mesh:
     try:
-        with path.open() as file:
-            loaded = load_obj(file, resolver=_Neighbours(str(path)))
+        with path.open() as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # about pieces without texture coordinates
+            loaded = load_obj(file, resolver=_Neighbours(str(path)), group_material=False)
     except (OSError, ValueError, IndexError) as error:
         raise DeskError(f"{path} cannot be read as OBJ: {error}") from error
-    pieces = list(loaded["geometry"].values()) if "geometry" in loaded else [loaded]
+    # In the file's order (they come last first): of two faces in one place it decides which one is seen.
+    pieces = list(loaded["geometry"].values())[::-1] if "geometry" in loaded else [loaded]
     faces, points, normals, uvs, count = [], [], [], [], 0
     for piece in pieces:
         corners, vertices = np.asarray(piece["faces"]), np.asarray(piece["vertices"], np.float32)

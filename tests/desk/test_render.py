@@ -1,0 +1,166 @@
+"""Our renderers against PyBullet's."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from lerobot_lansar.desk import SCENES, Desk, DeskError
+from lerobot_lansar.desk.render import raster
+from lerobot_lansar.desk.render.visuals import load_mesh
+
+CAMERAS = ("static", "gripper")
+
+
+def along_a_motion(desk, states=4):
+    """The pictures of some states of a motion with contacts, and their depths."""
+    rng = np.random.default_rng(3)
+    desk.reset(seed=2)
+    for _ in range(states):
+        for _ in range(15):
+            desk.step([*rng.uniform(-1, 1, 2), -0.5, *rng.uniform(-1, 1, 3), rng.choice([-1, 1])])
+        for camera in CAMERAS:
+            yield camera, desk.render(camera).astype(int), desk.render_depth(camera)
+
+
+def compare(scene, assets, ours, reference):
+    """Mean difference of each camera's pictures, and the share of pixels whose depths differ by over 1 %."""
+    colors, depths = {c: [] for c in CAMERAS}, []
+    with Desk(scene, assets, (), ours) as one, Desk(scene, assets, (), reference) as other:
+        for (camera, picture, depth), (_, expected, far) in zip(
+            along_a_motion(one), along_a_motion(other), strict=True
+        ):
+            colors[camera].append(np.abs(picture - expected).mean())
+            depths.append((np.abs(depth / far - 1) > 0.01).mean())
+    return {camera: max(values) for camera, values in colors.items()}, max(depths)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_fast_draws_what_tinyrenderer_draws_on_the_built_in_desk(scene):
+    colors, depth = compare(scene, None, "fast", "tiny")
+    assert colors["static"] < 0.02
+    assert colors["gripper"] < 0.02
+    assert depth < 1e-3
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_fast_draws_what_tinyrenderer_draws_on_the_original_desk(original_assets, scene):
+    colors, depth = compare(scene, original_assets, "fast", "tiny")
+    assert colors["static"] < 0.02
+    assert colors["gripper"] < 0.02
+    assert depth < 1e-3
+
+
+def _egl_works():
+    """Tried in another process: a driver that is not to be trusted may end it."""
+    code = "from lerobot_lansar.desk import Desk; Desk('D', cameras=(), renderer='egl').render()"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120).returncode == 0
+
+
+@pytest.fixture(scope="module")
+def egl():
+    if not _egl_works():
+        pytest.skip("needs an OpenGL driver with EGL")
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_fast_gl_draws_what_the_egl_plugin_draws(original_assets, egl, scene):
+    colors, depth = compare(scene, original_assets, "fast_gl", "egl")
+    assert colors["static"] < 1.5
+    assert colors["gripper"] < 2.5
+    assert depth < 0.02
+
+
+def test_lights_and_any_size():
+    with Desk("D", cameras=()) as desk:
+        off = desk.reset(seed=0)["scene_obs"]
+        dark = desk.render("static", 64)
+        on = off.copy()
+        on[4:6] = 1
+        desk.reset(None, on)
+        assert dark.shape == (64, 64, 3)
+        changed = np.abs(desk.render("static", 64).astype(int) - dark).max(-1) > 50
+        assert 0 < changed.mean() < 0.05
+        desk.reset(None, off)
+        np.testing.assert_array_equal(desk.render("static", 64), dark)
+
+
+def test_a_second_desk_in_the_process_draws_the_same(capfd):
+    with Desk("D") as first:
+        one = first.reset(seed=1)
+        with Desk("D") as second:
+            two = second.reset(seed=1)
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(one[f"rgb_{camera}"], two[f"rgb_{camera}"])
+
+
+def test_observations_hold_depth_when_asked():
+    with Desk("B", cameras=("gripper",), depth=True) as desk:
+        obs = desk.reset()
+    assert obs["depth_gripper"].shape == (84, 84)
+    assert obs["depth_gripper"].dtype == np.float32
+    assert 0.01 < obs["depth_gripper"].min() < obs["depth_gripper"].max() <= 2
+
+
+def test_drawing_does_not_change_the_motion():
+    def motion(draw):
+        rng = np.random.default_rng(0)
+        with Desk("D", cameras=()) as desk:
+            desk.reset(seed=4)
+            states = []
+            for _ in range(30):
+                obs = desk.step(rng.uniform(-1, 1, 7))
+                states.append(np.concatenate([obs["robot_obs"], obs["scene_obs"]]))
+                if draw:
+                    desk.render("static"), desk.render("gripper")
+        return np.array(states)
+
+    np.testing.assert_array_equal(motion(True), motion(False))
+
+
+def test_a_triangle_that_reaches_behind_the_eye_is_cut_at_the_near_plane():
+    # a floor that passes under the eye, 1 m below it, seen by a camera that looks along it
+    size = 32
+    vertices = np.array([[-9, 9, 9, -9], [-1, -1, -1, -1], [5, 5, -5, -5]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    lens = np.array([[16, 0, 16, 0], [0, 16, 16, 0], [0, 0, 1, 0]], np.float32)
+    screen = np.empty((3, 4), np.float32)
+    behind = raster.project(vertices, lens, screen)
+    assert behind
+    closeness = np.zeros((size, size), np.float32)
+    ids = np.full((size, size), raster.NOTHING, np.int32)
+    for order in (faces, faces[:, ::-1].copy()):
+        raster.nearest(
+            order, 0, 2, screen, behind, (np.float32(0.1), np.float32(4)), np.float32(0), (0.0, 0.0, 0.0), closeness, ids
+        )  # fmt: skip
+    rows = np.arange(size) - 16
+    expected = np.where((rows < 0) & (rows <= -16 / 4), -rows / 16, 0)  # 1 / distance of the floor, up to 4 m
+    np.testing.assert_allclose(closeness, np.repeat(expected[:, None], size, 1), atol=1e-6)
+
+
+def test_the_pieces_of_a_mesh_keep_the_files_order(tmp_path):
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 1 0 0\nnewmtl b\nKd 0 1 0\n")
+    (tmp_path / "m.obj").write_text(
+        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+        "o one\nusemtl a\nf 1 2 3\no two\nusemtl b\nf 1 2 4\nf 2 3 4\no three\nusemtl a\nf 1 3 4\n"
+    )
+    mesh = load_mesh(str(tmp_path / "m.obj"))
+    corners = mesh.vertices[mesh.faces].sum(1)
+    np.testing.assert_array_equal(corners, [[1, 1, 0], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    np.testing.assert_allclose(mesh.normals[0], [[0, 0, 1]] * 3)
+    assert mesh.texture is None
+
+
+def test_meshes_that_cannot_be_read_are_named(tmp_path):
+    for name in ("a.dae", "b.stl"):
+        (tmp_path / name).write_bytes(b"nothing")
+        with pytest.raises(DeskError, match=name):
+            load_mesh(str(tmp_path / name))
+
+
+def test_unknown_renderers_are_refused():
+    with pytest.raises(
+        DeskError, match=r"renderer 'vulkan' is unknown; choose among fast, fast_gl, tiny, egl"
+    ):
+        Desk("D", renderer="vulkan")
