@@ -73,16 +73,22 @@ class Desk:
         self.cameras = tuple(cameras)
         self.renderer = renderer
         self.depth = depth
-        self._renderer: Renderer | None = None
+        self._assets_folder = assets
         self._actions: list[tuple[np.ndarray, str]] = []
         self._client = -1
-        with open_assets(self.scene, assets) as files:
+        self._open()
+        self.reset()
+
+    def _open(self) -> None:
+        """Starts a Bullet client and loads all bodies."""
+        self._renderer: Renderer | None = None
+        self._diverged = False
+        with open_assets(self.scene, self._assets_folder) as files:
             self.assets = files.kind
             self._client = p.connect(p.DIRECT)
             self._require_open()
             try:
                 self._load(files)
-                self.reset()
             except BaseException:
                 self.close()
                 raise
@@ -127,6 +133,9 @@ class Desk:
         self._require_open()
         robot_state = None if robot_obs is None else _vector(robot_obs, 15, "robot_obs")
         scene_state = self._random_scene(seed) if scene_obs is None else _vector(scene_obs, 24, "scene_obs")
+        if self._diverged:  # what is not finite stays in Bullet's caches
+            self.close()
+            self._open()
         self._clear_contacts()
         self._put(robot_state, scene_state)
         self._history = SavedState(self.scene.name, self.assets, robot_state, scene_state, ())
@@ -183,6 +192,7 @@ class Desk:
         self._require_open()
         obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
         if not all(np.isfinite(state).all() for state in obs.values()):
+            self._diverged = True
             raise SimulationError(
                 "the simulation diverged: a state is no longer finite; reset the desk to go on"
             )

@@ -11,9 +11,9 @@ from PIL import Image
 from lerobot_lansar.desk import COLORS, SCENES, TASKS, BlockState, Desk, Snapshot, completed_tasks
 
 EXCEPTION = "slider_A"
-"""The one recording of 68 that is not repeated bit for bit: from its 173rd frame on, pushing the slide, joints differ by
-up to 0.008 rad. What was simulated before the reset decides (without our clearing step it parts at frame 177 instead),
-and what the original's fresh environment simulated at random before its first reset is not recorded."""
+"""The one recording of 68 that is not repeated bit for bit: from its 173rd frame on, pushing the slide, joints differ
+by up to 0.008 rad. What was simulated before the reset decides (without our clearing step it parts at frame 177), and
+what the original's fresh environment simulated at random before its first reset is not recorded."""
 
 TOLERANCE = 2
 """Frames by which a task may be fulfilled earlier or later than in ``dynamics``, which was recorded without

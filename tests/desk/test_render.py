@@ -125,14 +125,15 @@ def test_a_triangle_that_reaches_behind_the_eye_is_cut_at_the_near_plane():
     vertices = np.array([[-9, 9, 9, -9], [-1, -1, -1, -1], [5, 5, -5, -5]], np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     lens = np.array([[16, 0, 16, 0], [0, 16, 16, 0], [0, 0, 1, 0]], np.float32)
-    screen = np.empty((3, 4), np.float32)
+    screen = np.empty((4, 3), np.float32)
     behind = raster.project(vertices, lens, screen)
     assert behind
     closeness = np.zeros((size, size), np.float32)
     ids = np.full((size, size), raster.NOTHING, np.int32)
     for order in (faces, faces[:, ::-1].copy()):
         raster.nearest(
-            order, 0, 2, screen, behind, (np.float32(0.1), np.float32(4)), np.float32(0), (0.0, 0.0, 0.0), closeness, ids
+            order, 0, 2, screen, behind, (np.float32(0.1), np.float32(4)), np.float32(0), (0.0, 0.0, 0.0),
+            closeness, ids,
         )  # fmt: skip
     rows = np.arange(size) - 16
     expected = np.where((rows < 0) & (rows <= -16 / 4), -rows / 16, 0)  # 1 / distance of the floor, up to 4 m

@@ -5,6 +5,7 @@ of the picture, and draw what never moves once per standing camera.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,15 +38,17 @@ class FastRenderer:
         self._vertices = np.ascontiguousarray(np.concatenate([mesh.vertices for mesh in meshes]).T)
         self._faces = np.concatenate(
             [mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts[:-1], strict=True)]
-        )
+        ).astype(np.uint32)  # unsigned: numba need not look out for negative indices
         self._normals = np.concatenate([mesh.normals for mesh in meshes]).astype(np.float32)
         self._uvs = np.concatenate([mesh.uvs for mesh in meshes]).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(mesh.faces) for mesh in meshes])
-        self._screen = np.empty_like(self._vertices)
+        self._screen = np.empty((self._vertices.shape[1], 3), np.float32)
         self._parts = [_Part(self._vertices[:, v], v, f) for v, f in _ranges(stage.groups)]
         self._still = [i for i, group in enumerate(stage.groups) if group.still]
         self._moving = [i for i, group in enumerate(stage.groups) if not group.still]
-        self._backdrops: dict[tuple[int, bytes], tuple[np.ndarray, np.ndarray]] = {}
+        # blocks tremble where they lie; joints stand still to the last bit
+        self._slow = [i for i in self._moving if stage.groups[i].jointed]
+        self._backdrops: dict[tuple[int, bytes], tuple[_Layer, _Layer]] = {}
 
     def draw(
         self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False
@@ -65,19 +68,35 @@ class FastRenderer:
         """
         lens = self._lens(camera, size) @ view
         poses = self._stage.poses()
-        everything = range(len(self._parts))
         if keep:
-            key = size, lens.tobytes()
-            if key not in self._backdrops:
-                canvas, closeness = self._blank(size), np.zeros((size, size), np.float32)
-                self._paint(self._still, lens, camera, poses, {}, canvas, closeness)
-                self._backdrops[key] = canvas, closeness
-            canvas, closeness = (array.copy() for array in self._backdrops[key])
-            self._paint(self._moving, lens, camera, poses, colors, canvas, closeness)
+            layer, rest = self._settled(camera, lens, size, poses, colors)
+            canvas, closeness = layer.canvas.copy(), layer.closeness.copy()
         else:
             canvas, closeness = self._blank(size), np.zeros((size, size), np.float32)
-            self._paint(everything, lens, camera, poses, colors, canvas, closeness)
+            rest = list(range(len(self._parts)))
+        self._paint(rest, lens, camera, poses, colors, canvas, closeness)
         return self._finish(canvas, closeness, poses), self._inverse(closeness, camera)[::-1]
+
+    def _settled(
+        self, camera: Camera, lens: np.ndarray, size: int, poses: np.ndarray, colors: Colors
+    ) -> tuple["_Layer", list[int]]:
+        """A painting of what has not moved since the last picture of this camera, and the groups it lacks."""
+        key = size, lens.tobytes()
+        if key not in self._backdrops:
+            bottom = _Layer(self._blank(size), np.zeros((size, size), np.float32), poses.copy(), colors, [])
+            self._paint(self._still, lens, camera, poses, {}, bottom.canvas, bottom.closeness)
+            self._backdrops[key] = bottom, bottom
+        bottom, layer = self._backdrops[key]
+        same = (poses == layer.poses).all((1, 2))
+        groups = [i for i in self._slow if same[i]] if colors == layer.colors else []
+        if groups != layer.groups:
+            layer = _Layer(bottom.canvas.copy(), bottom.closeness.copy(), poses.copy(), colors, groups)
+            self._paint(groups, lens, camera, poses, colors, layer.canvas, layer.closeness)
+        else:  # the groups painted have not moved: only the others' poses are new
+            layer.poses[:] = poses
+            layer.colors = colors
+        self._backdrops[key] = bottom, layer
+        return layer, [i for i in self._moving if i not in groups]
 
     def _rule(self, camera: Camera, group: int) -> tuple[float, float, float]:
         """What :func:`.raster.nearest` calls close; 1 / w by default."""
@@ -123,7 +142,7 @@ class FastRenderer:
             part, matrix = self._parts[index], matrices[index]
             if raster.outside(matrix, part.center, part.radius, size):
                 continue
-            behind = raster.project(self._vertices[:, part.vertices], matrix, self._screen[:, part.vertices])
+            behind = raster.project(self._vertices[:, part.vertices], matrix, self._screen[part.vertices])
             first, last = part.faces.start, part.faces.stop
             raster.nearest(
                 self._faces, first, last, self._screen, behind, limits, self.smallest, self._rule(camera, index),
@@ -136,6 +155,21 @@ class FastRenderer:
                 if key in colors:
                     tints[index] = colors[key]
         self._shade(ids, poses, tints, canvas)
+
+
+@dataclass
+class _Layer:
+    """Part of a picture: ``groups`` are painted on it, besides what never moves.
+
+    Attributes:
+        poses, colors: As they were when the camera last took a picture.
+    """
+
+    canvas: np.ndarray
+    closeness: np.ndarray
+    poses: np.ndarray
+    colors: Colors
+    groups: list[int]
 
 
 class _Part:

@@ -44,6 +44,7 @@ class OpenGLLook(FastRenderer):
         self._casters = np.zeros((extent, extent), np.float32)
         poses = self._stage.poses()
         self._cast(self._still, poses, self._casters)
+        self._heights, self._shadow_of = self._casters, np.zeros(0)
 
     def _blank(self, size: int) -> np.ndarray:
         return np.zeros((size, size, 8), np.float32)
@@ -65,11 +66,13 @@ class OpenGLLook(FastRenderer):
         )  # fmt: skip
 
     def _finish(self, canvas: np.ndarray, closeness: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        heights = self._casters.copy()
-        self._cast(self._moving, poses, heights)
+        if not np.array_equal(poses, self._shadow_of):  # both cameras see the same shadow
+            self._heights = self._casters.copy()
+            self._cast(self._moving, poses, self._heights)
+            self._shadow_of = poses.copy()
         picture = np.empty((*closeness.shape, 3), np.uint8)
         picture[:] = BACKGROUND
-        raster.compose_gl(canvas, closeness, heights, STEP, picture)
+        raster.compose_gl(canvas, closeness, self._heights, STEP, picture)
         return picture
 
     def _cast(self, groups: list[int], poses: np.ndarray, heights: np.ndarray) -> None:
@@ -80,7 +83,7 @@ class OpenGLLook(FastRenderer):
         for index in groups:
             part = self._parts[index]
             raster.project_flat(
-                self._vertices[:, part.vertices], matrices[index], self._screen[:, part.vertices]
+                self._vertices[:, part.vertices], matrices[index], self._screen[part.vertices]
             )
             first, last = part.faces.start, part.faces.stop
             raster.nearest(

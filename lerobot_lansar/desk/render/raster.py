@@ -32,18 +32,17 @@ def outside(matrix, center, radius, size):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def project(vertices, matrix, screen):  # type: ignore[no-untyped-def]
-    """Vertices (3, V) to ``screen`` (3, V): column, row, w. Returns whether any lies behind the eye."""
+    """Vertices (3, V) to ``screen`` (V, 3): column, row, w. Returns whether any lies behind the eye."""
     m00, m01, m02, m03 = matrix[0]
     m10, m11, m12, m13 = matrix[1]
     m20, m21, m22, m23 = matrix[2]
     x, y, z = vertices[0], vertices[1], vertices[2]
-    column, row, depth = screen[0], screen[1], screen[2]
     least = np.float32(np.inf)
     for v in range(x.size):
         w = m20 * x[v] + m21 * y[v] + m22 * z[v] + m23
-        column[v] = (m00 * x[v] + m01 * y[v] + m02 * z[v] + m03) / w
-        row[v] = (m10 * x[v] + m11 * y[v] + m12 * z[v] + m13) / w
-        depth[v] = w
+        screen[v, 0] = (m00 * x[v] + m01 * y[v] + m02 * z[v] + m03) / w
+        screen[v, 1] = (m10 * x[v] + m11 * y[v] + m12 * z[v] + m13) / w
+        screen[v, 2] = w
         least = min(least, w)
     return least <= 0
 
@@ -58,18 +57,17 @@ def nearest(faces, first, last, screen, behind, limits, smallest, rule, closenes
     buffer of few bits, and of two equals the one of higher rank stays, or the earlier one.
     """
     size = closeness.shape[0]
-    column, row, depth = screen[0], screen[1], screen[2]
     near, far = 1 / limits[0], 1 / limits[1]
     zero, end = np.float32(0), np.float32(size - 1)
     for f in range(first, last):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        if behind and (depth[a] <= 0 or depth[b] <= 0 or depth[c] <= 0):
-            if depth[a] > limits[0] or depth[b] > limits[0] or depth[c] > limits[0]:
+        if behind and (screen[a, 2] <= 0 or screen[b, 2] <= 0 or screen[c, 2] <= 0):
+            if screen[a, 2] > limits[0] or screen[b, 2] > limits[0] or screen[c, 2] > limits[0]:
                 _clipped(f, a, b, c, screen, limits[0], smallest, rule, closeness, ids)
             continue
-        xa, ya = column[a], row[a]
-        xb, yb = column[b], row[b]
-        xc, yc = column[c], row[c]
+        xa, ya = screen[a, 0], screen[a, 1]
+        xb, yb = screen[b, 0], screen[b, 1]
+        xc, yc = screen[c, 0], screen[c, 1]
         # most faces fail one of these; testing all at once spares the processor a guess for each
         area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
         x0 = int(np.ceil(max(min(xa, xb, xc), zero)))
@@ -79,17 +77,16 @@ def nearest(faces, first, last, screen, behind, limits, smallest, rule, closenes
         if not ((area > smallest) & (x0 <= x1) & (y0 <= y1)):
             continue
         _fill(
-            f, xa, ya, 1 / depth[a], xb, yb, 1 / depth[b], xc, yc, 1 / depth[c], x0, x1, y0, y1, near, far, rule,
+            f, xa, ya, screen[a, 2], xb, yb, screen[b, 2], xc, yc, screen[c, 2], x0, x1, y0, y1, near, far, rule,
             closeness, ids,
         )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def _fill(f, xa, ya, ia, xb, yb, ib, xc, yc, ic, x0, x1, y0, y1, near, far, rule, closeness, ids):  # type: ignore[no-untyped-def]
+def _fill(f, xa, ya, wa, xb, yb, wb, xc, yc, wc, x0, x1, y0, y1, near, far, rule, closeness, ids):  # type: ignore[no-untyped-def]
     xa, ya, xb, yb, xc, yc = float(xa), float(ya), float(xb), float(yb), float(xc), float(yc)
-    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-    ia, ib, ic = ia / area, ib / area, ic / area
     offset, scale, rank = rule
+    ia, ib, ic = 0.0, 0.0, 0.0
     for y in range(y0, y1 + 1):
         # Each edge function is linear along the row; faces that share an edge see exactly opposite values there.
         ea0, ea1 = xb * (yc - y) - xc * (yb - y), yb - yc
@@ -100,6 +97,9 @@ def _fill(f, xa, ya, ia, xb, yb, ib, xc, yc, ic, x0, x1, y0, y1, near, far, rule
             eb = eb0 + x * eb1
             ec = ec0 + x * ec1
             if (ea >= 0) & (eb >= 0) & (ec >= 0):
+                if ia == 0.0:  # most small faces never come here
+                    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+                    ia, ib, ic = 1 / (area * wa), 1 / (area * wb), 1 / (area * wc)
                 value = np.float32(ea * ia + eb * ib + ec * ic)
                 if value < far or value > near:
                     continue
@@ -116,19 +116,19 @@ def _fill(f, xa, ya, ia, xb, yb, ib, xc, yc, ic, x0, x1, y0, y1, near, far, rule
 @njit(cache=True, error_model="numpy")
 def _clipped(f, a, b, c, screen, near, smallest, rule, closeness, ids):  # type: ignore[no-untyped-def]
     """A face that reaches behind the eye: what is left of it beyond the near plane."""
-    w = screen[2]
     polygon = np.empty((4, 3), np.float32)
     count = 0
     corners = (a, b, c)
     for k in range(3):
         p, q = corners[k], corners[(k + 1) % 3]
-        if w[p] > near:
-            polygon[count] = screen[0, p], screen[1, p], w[p]
+        if screen[p, 2] > near:
+            polygon[count] = screen[p, 0], screen[p, 1], screen[p, 2]
             count += 1
-        if (w[p] > near) != (w[q] > near):
-            t = (near - w[p]) / (w[q] - w[p])
+        if (screen[p, 2] > near) != (screen[q, 2] > near):
+            wp, wq = screen[p, 2], screen[q, 2]
+            t = (near - wp) / (wq - wp)
             for i in range(2):
-                polygon[count, i] = ((1 - t) * screen[i, p] * w[p] + t * screen[i, q] * w[q]) / near
+                polygon[count, i] = ((1 - t) * screen[p, i] * wp + t * screen[q, i] * wq) / near
             polygon[count, 2] = near
             count += 1
     size = closeness.shape[0]
@@ -141,7 +141,7 @@ def _clipped(f, a, b, c, screen, near, smallest, rule, closeness, ids):  # type:
         y0 = int(np.ceil(max(min(pa[1], pb[1], pc[1]), 0)))
         y1 = int(np.floor(min(max(pa[1], pb[1], pc[1]), size - 1)))
         _fill(
-            f, pa[0], pa[1], 1 / pa[2], pb[0], pb[1], 1 / pb[2], pc[0], pc[1], 1 / pc[2], x0, x1, y0, y1, np.inf, 0,
+            f, pa[0], pa[1], pa[2], pb[0], pb[1], pb[2], pc[0], pc[1], pc[2], x0, x1, y0, y1, np.inf, 0,
             rule, closeness, ids,
         )  # fmt: skip
 
@@ -150,9 +150,9 @@ def _clipped(f, a, b, c, screen, near, smallest, rule, closeness, ids):  # type:
 def weights(f, x, y, faces, screen):  # type: ignore[no-untyped-def]
     """Perspective-correct weights of a face's three corners at the sample (x, y)."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-    xa, ya, wa = float(screen[0, a]), float(screen[1, a]), float(screen[2, a])
-    xb, yb, wb = float(screen[0, b]), float(screen[1, b]), float(screen[2, b])
-    xc, yc, wc = float(screen[0, c]), float(screen[1, c]), float(screen[2, c])
+    xa, ya, wa = float(screen[a, 0]), float(screen[a, 1]), float(screen[a, 2])
+    xb, yb, wb = float(screen[b, 0]), float(screen[b, 1]), float(screen[b, 2])
+    xc, yc, wc = float(screen[c, 0]), float(screen[c, 1]), float(screen[c, 2])
     ea = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) / wa
     eb = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) / wb
     ec = ((xa - x) * (yb - y) - (xb - x) * (ya - y)) / wc
@@ -353,6 +353,6 @@ def project_flat(vertices, matrix, screen):  # type: ignore[no-untyped-def]
     """As :func:`project` without perspective: column, row and 1 / the third coordinate."""
     x, y, z = vertices[0], vertices[1], vertices[2]
     for v in range(x.size):
-        screen[0, v] = matrix[0, 0] * x[v] + matrix[0, 1] * y[v] + matrix[0, 2] * z[v] + matrix[0, 3]
-        screen[1, v] = matrix[1, 0] * x[v] + matrix[1, 1] * y[v] + matrix[1, 2] * z[v] + matrix[1, 3]
-        screen[2, v] = 1 / (matrix[2, 0] * x[v] + matrix[2, 1] * y[v] + matrix[2, 2] * z[v] + matrix[2, 3])
+        screen[v, 0] = matrix[0, 0] * x[v] + matrix[0, 1] * y[v] + matrix[0, 2] * z[v] + matrix[0, 3]
+        screen[v, 1] = matrix[1, 0] * x[v] + matrix[1, 1] * y[v] + matrix[1, 2] * z[v] + matrix[1, 3]
+        screen[v, 2] = 1 / (matrix[2, 0] * x[v] + matrix[2, 1] * y[v] + matrix[2, 2] * z[v] + matrix[2, 3])

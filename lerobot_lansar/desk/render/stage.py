@@ -16,12 +16,14 @@ class Group:
 
     Attributes:
         still: They never move and never change their colour.
+        jointed: The link belongs to a body with joints.
     """
 
     body: int
     link: int
     visuals: list[Visual]
     still: bool
+    jointed: bool
 
 
 class Stage:
@@ -48,6 +50,7 @@ class Stage:
                 link,
                 [visual for visual in visuals if (visual.body, visual.link) == (body, link)],
                 (body, link) not in repainted and not self._moves(body, link),
+                body in self._jointed,
             )
             for body, link in keys
         ]

@@ -153,10 +153,10 @@ def _load_obj(path: Path) -> Mesh:
         points.append(vertices)
         faces.append(corners + count)
         count += len(vertices)
-    vertices, places = np.unique(np.concatenate(points), axis=0, return_inverse=True)
+    vertices, places = _merged(np.concatenate(points), np.concatenate(faces))
     return Mesh(
         vertices,
-        places[np.concatenate(faces)].astype(np.int32),
+        places,
         np.concatenate(normals).astype(np.float32),
         np.concatenate(uvs).astype(np.float32),
         _texture(pieces),
@@ -185,10 +185,11 @@ def _load_stl(path: Path) -> Mesh:
         raise DeskError(f"{path} is no binary STL file: {len(data)} bytes, expected {84 + 50 * count}")
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")])
     triangles = np.frombuffer(data, record, count, 84)
-    vertices, faces = np.unique(triangles["corners"].reshape(-1, 3), axis=0, return_inverse=True)
+    corners = triangles["corners"].reshape(-1, 3)
+    vertices, faces = _merged(corners, np.arange(len(corners)).reshape(-1, 3))
     normals = np.repeat(triangles["normal"][:, None], 3, axis=1)
     uvs = np.full((count, 3, 2), 0.5, np.float32)
-    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32), _unit(normals), uvs)
+    return Mesh(vertices, faces, _unit(normals), uvs)
 
 
 @cache
@@ -232,6 +233,15 @@ def _hull(points: np.ndarray) -> Mesh:
     inward = (_face_normals(points, faces) * points[faces].mean(1)).sum(1) < 0
     faces[inward] = faces[inward, ::-1]
     return Mesh(points, faces, _unit(points)[faces], np.full((len(faces), 3, 2), 0.5, np.float32))
+
+
+def _merged(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Equal points become one vertex; vertices in the order in which faces use them, which processors like."""
+    vertices, first, places = np.unique(points[faces.ravel()], axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int32)
+    order = np.argsort(first)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    return vertices[order].astype(np.float32), rank[places.ravel()].reshape(-1, 3)
 
 
 def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
