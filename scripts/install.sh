@@ -32,4 +32,10 @@ if ! numpy_enabled; then
         exit 1
     }
 fi
+echo "compiling the renderers (once)"
+.venv/bin/python -c '
+from lerobot_lansar.desk import Desk
+for renderer in ("fast", "fast_gl"):
+    with Desk("D", renderer=renderer): pass
+' >/dev/null
 touch .venv/.installed

@@ -5,6 +5,7 @@ sphere, looks are our own. Handles have their measured sizes, so a hand that pul
 Lengths in metres, nothing is scaled on loading.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,14 +19,16 @@ Range = tuple[float, float]
 Color = Sequence[float]
 
 BLOCK_COLORS = {"red": (0.92, 0.12, 0.12), "blue": (0.12, 0.20, 0.92), "pink": (0.95, 0.25, 0.85)}
+_CUBE = "cube"
 WHITE, BLACK, FLOOR = (1.0, 1.0, 1.0), (0.08, 0.08, 0.08), (0.78, 0.80, 0.83)
 
 
 def write(scene: Scene, folder: Path) -> dict[str, Path]:
     """Writes robot.urdf, desk.urdf, plane.urdf and one URDF per block into ``folder``; returns the blocks' files."""
+    _prism(folder, _CUBE, (-0.5, 0.5), ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)), WHITE)
     (folder / "robot.urdf").write_text(_robot())
     (folder / "desk.urdf").write_text(_desk(scene, folder))
-    (folder / "plane.urdf").write_text(_plane())
+    (folder / "plane.urdf").write_text(_plane(folder))
     blocks = {}
     for color, variant in scene.blocks.items():
         blocks[color] = folder / f"block_{color}.urdf"
@@ -39,9 +42,13 @@ def write(scene: Scene, folder: Path) -> dict[str, Path]:
 def _shape(geometry: str, color: Color, xyz: Sequence[float] = (0, 0, 0), collides: bool = True) -> str:
     rgba = " ".join(f"{c:.3f}" for c in (*color, 1.0))
     origin = f'<origin xyz="{xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f}"/>'
-    body = f"{origin}<geometry>{geometry}</geometry>"
-    visual = f'<visual>{body}<material name="c{rgba}"><color rgba="{rgba}"/></material></visual>'
-    return visual + (f"<collision>{body}</collision>" if collides else "")
+    # Bullet's OpenGL renderer lights boxes as if they were round; it does not do so with meshes
+    seen = geometry.replace("<box size=", f'<mesh filename="{_CUBE}.obj" scale=')
+    visual = (
+        f"<visual>{origin}<geometry>{seen}</geometry>"
+        f'<material name="c{rgba}"><color rgba="{rgba}"/></material></visual>'
+    )
+    return visual + (f"<collision>{origin}<geometry>{geometry}</geometry></collision>" if collides else "")
 
 
 def _box(x: Range, y: Range, z: Range, color: Color) -> str:
@@ -113,13 +120,19 @@ def _block(color: str, length: float) -> str:
     return _robot_document(f"block_{color}", _link("base_link", 1.0, box, contact))
 
 
-def _plane() -> str:
-    tile, shapes = 0.5, []
-    for i in range(-6, 6):
-        for j in range(-6, 6):
-            shade = [c * (1.0 if (i + j) % 2 else 0.93) for c in FLOOR]
-            box = f'<box size="{tile} {tile} 0.01"/>'
-            shapes.append(_shape(box, shade, ((i + 0.5) * tile, (j + 0.5) * tile, -0.005), collides=False))
+def _plane(folder: Path) -> str:
+    """A floor of tiles in two shades, each shade one mesh; what carries is one big box."""
+    shapes = []
+    for odd, shade in enumerate((0.93, 1.0)):
+        lines, faces = ["vn 0 0 1"], []
+        for i, j in itertools.product(range(-6, 6), range(-6, 6)):
+            if (i + j) % 2 == odd:
+                corner = len(lines)
+                lines += [f"v {(i + u) / 2} {(j + v) / 2} 0" for u, v in ((0, 0), (1, 0), (1, 1), (0, 1))]
+                faces += [f"f {corner}//1 {corner + k}//1 {corner + k + 1}//1" for k in (1, 2)]
+        (folder / f"floor_{odd}.obj").write_text("\n".join(lines + faces) + "\n")
+        color = [c * shade for c in FLOOR]
+        shapes.append(_shape(f'<mesh filename="floor_{odd}.obj"/>', color, collides=False))
     ground = '<collision><origin xyz="0 0 -5"/><geometry><box size="200 200 10"/></geometry></collision>'
     contact = '<contact><lateral_friction value="1"/></contact>'
     return _robot_document("plane", _link("base_link", 0.0, "".join(shapes) + ground, contact))

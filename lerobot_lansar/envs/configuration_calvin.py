@@ -9,6 +9,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from ..desk import Desk
 from ..desk.cameras import CAMERAS
 from ..desk.errors import DeskError
 from .calvin import LH_MTLC, CalvinEnv
@@ -98,6 +99,9 @@ class CalvinEnvConfig(EnvConfig):
                 }
                 for task, made in makers.items()
             }
+        if self.renderer.startswith("fast"):  # compiled kernels and meshes are read once, before the fork
+            with Desk(self.scene, self.assets, cameras=(), renderer=self.renderer) as desk:
+                desk.render()
         envs = {task: ForkedVectorEnv(made) for task, made in makers.items()}
         envs[tasks[0]]._ensure()
         return {task: {0: env} for task, env in envs.items()}  # type: ignore[dict-item]

@@ -72,6 +72,13 @@ def test_fast_gl_draws_what_the_egl_plugin_draws(original_assets, egl, scene):
     assert depth < 0.02
 
 
+def test_fast_gl_draws_the_built_in_desk_as_the_egl_plugin_does(egl):
+    colors, depth = compare("D", None, "fast_gl", "egl")
+    assert colors["static"] < 1.5
+    assert colors["gripper"] < 2.5
+    assert depth < 0.02
+
+
 def test_lights_and_any_size():
     with Desk("D", cameras=()) as desk:
         off = desk.reset(seed=0)["scene_obs"]

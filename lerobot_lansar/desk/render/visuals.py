@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +110,7 @@ def _shape(kind: int, size: tuple[float, ...], file: str, round_boxes: bool) -> 
     raise DeskError(f"a visual shape of Bullet's kind {kind} cannot be drawn; choose renderer tiny or egl")
 
 
-@cache
+@lru_cache(64)  # temporary files come and go under ever new names
 def load_mesh(file: str) -> Mesh:
     """A mesh from an OBJ file (with the texture its material names) or a binary STL file.
 
@@ -172,7 +172,7 @@ def _texture(pieces: Sequence[dict[str, Any]]) -> np.ndarray | None:
     return None
 
 
-@cache
+@lru_cache(32)
 def _shared(width: int, height: int, pixels: bytes) -> np.ndarray:
     """Equal pictures become one array."""
     return np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
