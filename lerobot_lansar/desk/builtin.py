@@ -7,6 +7,7 @@ Lengths in metres, nothing is scaled on loading.
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,13 +20,11 @@ Range = tuple[float, float]
 Color = Sequence[float]
 
 BLOCK_COLORS = {"red": (0.92, 0.12, 0.12), "blue": (0.12, 0.20, 0.92), "pink": (0.95, 0.25, 0.85)}
-_CUBE = "cube"
 WHITE, BLACK, FLOOR = (1.0, 1.0, 1.0), (0.08, 0.08, 0.08), (0.78, 0.80, 0.83)
 
 
 def write(scene: Scene, folder: Path) -> dict[str, Path]:
     """Writes robot.urdf, desk.urdf, plane.urdf and one URDF per block into ``folder``; returns the blocks' files."""
-    _prism(folder, _CUBE, (-0.5, 0.5), ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)), WHITE)
     (folder / "robot.urdf").write_text(_robot())
     (folder / "desk.urdf").write_text(_desk(scene, folder))
     (folder / "plane.urdf").write_text(_plane(folder))
@@ -33,6 +32,10 @@ def write(scene: Scene, folder: Path) -> dict[str, Path]:
     for color, variant in scene.blocks.items():
         blocks[color] = folder / f"block_{color}.urdf"
         blocks[color].write_text(_block(color, BLOCK_LENGTHS[variant]))
+    for file in folder.glob("*.urdf"):
+        for name in set(re.findall(r'"(box_\S+)\.obj"', file.read_text())):
+            x, y, z = (float(size) / 2 for size in name.split("_")[1:])
+            _prism(folder, name, (-x, x), ((-y, -z), (y, -z), (y, z), (-y, z)), WHITE)
     return blocks
 
 
@@ -43,7 +46,7 @@ def _shape(geometry: str, color: Color, xyz: Sequence[float] = (0, 0, 0), collid
     rgba = " ".join(f"{c:.3f}" for c in (*color, 1.0))
     origin = f'<origin xyz="{xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f}"/>'
     # Bullet's OpenGL renderer lights boxes as if they were round; it does not do so with meshes
-    seen = geometry.replace("<box size=", f'<mesh filename="{_CUBE}.obj" scale=')
+    seen = re.sub(r'<box size="(\S+) (\S+) (\S+)"/>', r'<mesh filename="box_\1_\2_\3.obj"/>', geometry)
     visual = (
         f"<visual>{origin}<geometry>{seen}</geometry>"
         f'<material name="c{rgba}"><color rgba="{rgba}"/></material></visual>'

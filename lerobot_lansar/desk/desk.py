@@ -96,6 +96,8 @@ class Desk:
     def _load(self, files: Assets) -> None:
         client = self._client
         self._pictures = Preparation(self.renderer, client)
+        if files.temporary:  # Bullet would remember every file by its ever new name
+            p.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
         p.setGravity(0, 0, -9.8, physicsClientId=client)
         self._robot = Robot(client, files)
         self._blocks = load_blocks(client, files, self.scene)
@@ -107,6 +109,8 @@ class Desk:
         self._names |= {block.body: color for color, block in self._blocks.items()}
         self._desk_links = {index: name for name, index in self._table.links.items()}
         self._pictures.loaded(files.temporary)
+        if files.temporary:
+            p.setPhysicsEngineParameter(enableFileCaching=1, physicsClientId=client)
 
     # ---- what users call
 
