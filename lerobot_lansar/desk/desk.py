@@ -47,7 +47,7 @@ class Desk:
     order in every scene, whereas CALVIN's own files follow each scene's configuration.
 
     Args:
-        scene: ``"A"``, ``"B"``, ``"C"`` or ``"D"``.
+        scene: ``"A"``, ``"B"``, ``"C"``, ``"D"``, or ``"D_eval"``: D with calvin_env's fixed evaluation layout.
         assets: None for the built-in desk, or the ``data`` folder of a calvin_env checkout for the original files.
         cameras: Pictures that observations hold: any of ``"static"`` (200x200) and ``"gripper"`` (84x84).
         renderer: ``"fast"`` (ours, in TinyRenderer's look), ``"fast_gl"`` (ours, in the OpenGL look of CALVIN's public
@@ -125,7 +125,7 @@ class Desk:
         Args:
             robot_obs: (15,) joints, opening width and gripper action are used; None: CALVIN's home pose, hand open.
             scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks placed at
-                random by ``seed`` as CALVIN does.
+                random by ``seed`` as CALVIN does, or where the scene's layout has them.
             seed: Decides the blocks' places when ``scene_obs`` is None.
 
         Returns:
@@ -319,7 +319,9 @@ class Desk:
         return name, self._desk_links[link] if name == "desk" else ""
 
     def _random_scene(self, seed: int | None) -> np.ndarray:
-        """Everything closed and off; each block on a surface chosen at random, no two of them touching."""
+        """Everything closed and off; blocks as the scene's layout says, or at random, no two of them touching."""
+        if self.scene.layout is not None:
+            return np.array([0.0] * 6 + [x for color in COLORS for x in self.scene.layout[color]])
         rng = np.random.default_rng(seed)
         areas = list(self.scene.areas.values())
         while True:

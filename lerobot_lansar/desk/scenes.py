@@ -4,7 +4,7 @@ Everything is in metres in the world frame, after CALVIN's global scaling of 0.8
 of furniture with its parts in different places, so a scene is a handful of numbers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .errors import DeskError
 
@@ -38,6 +38,7 @@ class Scene:
         cabinet: World x range of the open cabinet, whose floor is the plank.
         slide_travel: Upper limit of the sliding door (m).
         wood, dark_wood, metal: Colours (rgb in [0, 1]) of the built-in desk.
+        layout: Where each block starts: xyz (m), euler (rad); None: at random in ``areas``.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Scene:
     wood: tuple[float, float, float]
     dark_wood: tuple[float, float, float]
     metal: tuple[float, float, float]
+    layout: dict[str, tuple[float, ...]] | None = None
 
 
 DRAWER_TRAVEL = 0.22
@@ -142,12 +144,22 @@ SCENES = {
 }
 
 
+EVALUATION_LAYOUT: dict[str, tuple[float, ...]] = {
+    "red": (0.05, -0.12, 0.46, 0.0, 0.0, 1.57),
+    "blue": (0.05, -0.12, 0.51, 0.0, 0.0, 0.0),
+    "pink": (0.10, 0.08, 0.46, 0.0, 0.0, 1.57),
+}
+"""Where calvin_env's evaluation configuration of scene D puts the blocks (m, rad); the blue one falls on the red one."""
+
+
 def get_scene(name: str) -> Scene:
-    """The scene called ``name``.
+    """The scene called ``name``: A, B, C, D, or ``D_eval`` for D with the blocks in :data:`EVALUATION_LAYOUT`.
 
     Raises:
         DeskError: There is no such scene.
     """
+    if name == "D_eval":
+        return replace(SCENES["D"], layout=EVALUATION_LAYOUT)
     if name not in SCENES:
-        raise DeskError(f"scene {name!r} is unknown; choose one of {', '.join(SCENES)}")
+        raise DeskError(f"scene {name!r} is unknown; choose one of {', '.join(SCENES)}, D_eval")
     return SCENES[name]

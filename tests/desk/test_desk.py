@@ -49,6 +49,21 @@ def test_blocks_come_in_red_blue_pink_order_and_stay_where_they_are_put(scene):
     assert all(block.contacts == {("desk", "base_link")} for block in state.blocks.values())
 
 
+def test_the_evaluation_layout_of_scene_d_is_fixed():
+    with Desk("D_eval", cameras=()) as desk:
+        for seed in (0, 1):
+            desk.reset(seed=seed)
+            for _ in range(30):
+                obs = desk.step(ZERO)
+            red, blue, pink = obs["scene_obs"][6:].reshape(3, 6)
+            np.testing.assert_allclose(red[:2], [0.05, -0.12], atol=3e-3)
+            np.testing.assert_allclose(
+                blue[:3], [*red[:2], red[2] + 0.04], atol=4e-3
+            )  # it lies on the red one
+            np.testing.assert_allclose(pink[:2], [0.10, 0.08], atol=6e-3)  # the door pushes it a little
+        assert desk.scene.name == "D"
+
+
 def test_same_state_and_actions_give_the_same_motion_after_other_episodes(desk):
     start = sample_start(desk, "stack_block", np.random.default_rng(5))
     first = _trajectory(desk, start)
