@@ -149,7 +149,7 @@ EVALUATION_LAYOUT: dict[str, tuple[float, ...]] = {
     "blue": (0.05, -0.12, 0.51, 0.0, 0.0, 0.0),
     "pink": (0.10, 0.08, 0.46, 0.0, 0.0, 1.57),
 }
-"""Where calvin_env's evaluation configuration of scene D puts the blocks (m, rad); the blue one falls on the red one."""
+"""Where calvin_env's evaluation configuration of scene D puts the blocks (m, rad); blue falls on red."""
 
 
 def get_scene(name: str) -> Scene:
