@@ -34,7 +34,7 @@ ROUNDS = 5
 class Options:
     """What to measure."""
 
-    # Control steps per case and round; a quarter of it for the cases that draw with PyBullet.
+    # Control steps per case and round; a tenth of it for the naive loop.
     steps: int = 200
     scene: str = "D"
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
@@ -54,10 +54,11 @@ class Naive:
         client, robot = self._desk._client, self._desk._robot.body
         self._pose = self._pose + action[:6] * ([0.02] * 3 + [0.05] * 3)
         joints = self._desk._robot.joints_for(self._pose[:3], self._pose[3:])
-        for joint, value in [*enumerate(joints), (9, 0.04), (11, 0.04)]:
+        arm = [(joint, value, 200, 2) for joint, value in enumerate(joints)]
+        for joint, value, force, velocity in [*arm, (9, 0.04, 2, 1), (11, 0.04, 2, 1)]:
             p.setJointMotorControl2(
-                bodyIndex=robot, jointIndex=joint, controlMode=p.POSITION_CONTROL, force=200, targetPosition=value,
-                maxVelocity=2, physicsClientId=client,
+                bodyIndex=robot, jointIndex=joint, controlMode=p.POSITION_CONTROL, force=force, targetPosition=value,
+                maxVelocity=velocity, physicsClientId=client,
             )  # fmt: skip
         for _ in range(8):
             p.stepSimulation(physicsClientId=client)
@@ -106,25 +107,26 @@ def seconds_per_step(step: Callable[[], object], steps: int) -> float:
 
 def cases(options: Options) -> dict[str, Callable[[], object]]:
     """Name of each case to its step."""
-    act = actions()
 
     def stepping(**settings: object) -> Callable[[], object]:
+        act = actions()
         desk = Desk(options.scene, options.assets, **settings)  # type: ignore[arg-type]
         desk.step(act())  # compiles, loads meshes
         return lambda: desk.step(act())
 
     bare, judged, naive = (Desk(options.scene, options.assets, ()) for _ in range(3))
     start, slow = judged.snapshot(), Naive(naive)
+    bare_act, judged_act, slow_act = actions(), actions(), actions()  # the same motion in every case
 
     def floor() -> float:
-        bare._robot.command(act(), relative=True)
+        bare._robot.command(bare_act(), relative=True)
         started = time.perf_counter()
         for _ in range(8):
             p.stepSimulation(physicsClientId=bare._client)
         return time.perf_counter() - started
 
     def with_oracle() -> None:
-        judged.step(act())
+        judged.step(judged_act())
         judged.completed_tasks(start)
 
     return {
@@ -133,7 +135,7 @@ def cases(options: Options) -> dict[str, Callable[[], object]]:
         "no cameras, oracle": with_oracle,
         "both cameras, fast": stepping(),
         "both cameras, fast_gl": stepping(renderer="fast_gl"),
-        "naive loop": lambda: slow.step(act()),
+        "naive loop": lambda: slow.step(slow_act()),
     }
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from ..desk import CONTROL_HZ, TASKS, Desk, DeskError, Observation
+from ..desk import CONTROL_HZ, TASKS, Desk, DeskError, Observation, SimulationError
 from ..desk.commands import load_commands
 from ..desk.robot import ANGLE_STEP, POSITION_STEP
 from ..desk.starts import sample_start
@@ -57,7 +57,7 @@ class PlayConfig:
     output_dir: Path | None = None
     # Keys to press instead of a keyboard: 'd10 f5 space wait20 enter', a number for how many steps each is held.
     keys: str | None = None
-    # Write what is seen to this mp4; always written (to play.mp4) when there is no display.
+    # Write what is seen to this mp4; play.mp4 when keys are played or there is no display.
     video: Path | None = None
 
     def check(self) -> None:
@@ -68,6 +68,8 @@ class PlayConfig:
             raise DeskError(
                 f"--output_dir={self.output_dir} already holds a recording; choose another folder"
             )
+        if self.seed < 0:
+            raise DeskError(f"--seed={self.seed}: expected 0 or more")
         list(parse_keys(self.keys or ""))
 
 
@@ -103,6 +105,7 @@ class Session:
     def mark(self) -> None:
         """From here on the oracle judges, and a recording begins."""
         self.fulfilled: dict[str, int] = {}
+        self.steps = 0
         self._start = self.desk.snapshot()
         self._rows: list[dict[str, np.ndarray]] = []
 
@@ -114,7 +117,7 @@ class Session:
             self.begin()
         elif key == "enter":
             if self.recording and self.fulfilled and self.config.output_dir is not None:
-                self._keep(self.config.output_dir)
+                self._keep(self.config.output_dir)  # of what still holds
             self.recording = not self.recording and self.config.output_dir is not None
             self.mark()
 
@@ -127,23 +130,28 @@ class Session:
             self._target[axis] = pose[axis] + direction * units[axis]
         action = np.append(self._target, self._gripper)
         action[3:6] = (action[3:6] + np.pi) % (2 * np.pi) - np.pi
-        self._rows.append(
-            {**self.obs, "actions": action, "rel_actions": relative_action(action, self.obs["robot_obs"])}
-        )
+        if self.recording:
+            relative = relative_action(action, self.obs["robot_obs"])
+            self._rows.append({**self.obs, "actions": action, "rel_actions": relative})
+        self.steps += 1
         self.obs = self.desk.step(action, control_mode="abs")
-        for task in self.desk.completed_tasks(self._start):
-            self.fulfilled.setdefault(task, len(self._rows))
+        now = self.desk.completed_tasks(self._start)
+        self.fulfilled = {task: self.fulfilled.get(task, self.steps) for task in sorted(now)}
         return self.obs
 
     def _keep(self, output: Path) -> None:
-        task = max(self.fulfilled, key=lambda name: self.fulfilled[name])
+        asked = self.config.task
+        task = (
+            asked if asked in self.fulfilled else max(self.fulfilled, key=lambda name: self.fulfilled[name])
+        )
+        assert task is not None
         folder = output / ".playing" / f"{len(self.kept):06d}"
         frames = {key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]}
         write_frames(folder, frames, self.desk.scene)
         self.kept.append(Recording(folder, len(self._rows), task, self._commands[task][0]))
 
     def finish(self) -> None:
-        """Publishes the demonstrations kept as OUTPUT_DIR/training."""
+        """Publishes the demonstrations kept as OUTPUT_DIR/training; to be called however the session ended."""
         output = self.config.output_dir
         if output is None:
             return
@@ -163,9 +171,9 @@ class Session:
         draw = ImageDraw.Draw(canvas)
         x, y = SIZE + 12, SIZE // 2 + 10
         if self.recording:
-            draw.text((x, y), f"RECORDING, {len(self._rows)} frames", (255, 90, 90), _font(15))
+            draw.text((x, y), f"RECORDING, {self.steps} frames", (255, 90, 90), _font(15))
         else:
-            draw.text((x, y), f"{len(self._rows) / CONTROL_HZ:.1f} s", (200, 200, 200), _font(15))
+            draw.text((x, y), f"{self.steps / CONTROL_HZ:.1f} s", (200, 200, 200), _font(15))
         if self.kept:
             draw.text((x + 190, y), f"{len(self.kept)} kept", (200, 200, 200), _font(15))
         listed = sorted(self.fulfilled.items(), key=lambda item: -item[1])
@@ -296,15 +304,19 @@ def play(config: PlayConfig) -> Session:
         path = Path("play.mp4")
     with Desk(config.scene, config.assets, renderer=config.renderer) as desk:
         session = Session(config, desk)
+        if config.output_dir is not None:  # of a session that was killed
+            shutil.rmtree(config.output_dir / ".playing", ignore_errors=True)
         recorder: AbstractContextManager[_Video | None] = _Video(path) if path else nullcontext()
-        with recorder as video:
-            if pygame is None:
-                play_keys(session, config.keys or DEMONSTRATION, video)
-            else:
-                play_window(session, pygame, video)
-                pygame.quit()
+        try:
+            with recorder as video:
+                if pygame is None:
+                    play_keys(session, config.keys or DEMONSTRATION, video)
+                else:
+                    play_window(session, pygame, video)
+                    pygame.quit()
+        finally:
+            session.finish()
         print(f"fulfilled: {', '.join(session.fulfilled) or 'nothing'}")
-        session.finish()
     return session
 
 
@@ -312,9 +324,11 @@ def main() -> None:
     """Entry point of ``lansar-play``."""
     try:
         play(draccus.parse(PlayConfig))
-    except (DeskError, OSError, draccus.utils.ParsingError) as error:
+    except (DeskError, SimulationError, OSError, draccus.utils.ParsingError) as error:
         print(f"lansar-play: error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,9 @@ CONTROL_HZ = 30
 SUBSTEPS = 8
 """Simulation steps of 1/240 s per control step of 1/30 s."""
 
+LARGEST = 100.0
+"""No number of an action or a state may be larger: relative units, metres or radians."""
+
 Observation = dict[str, np.ndarray]
 
 _PARKING = 100.0  # where blocks wait while contact caches are cleared (m)
@@ -77,7 +80,11 @@ class Desk:
         self._actions: list[tuple[np.ndarray, str]] = []
         self._client = -1
         self._open()
-        self.reset()
+        try:
+            self.reset()
+        except BaseException:
+            self.close()
+            raise
 
     def _open(self) -> None:
         """Starts a Bullet client and loads all bodies."""
@@ -132,7 +139,7 @@ class Desk:
             The observation after one simulation step, as in CALVIN.
 
         Raises:
-            DeskError: A state of the wrong length or with a value that is not finite.
+            DeskError: A state of the wrong length, with a value that is not finite, or over :data:`LARGEST`.
         """
         self._require_open()
         robot_state = None if robot_obs is None else _vector(robot_obs, 15, "robot_obs")
@@ -156,7 +163,8 @@ class Desk:
             control_mode: ``"rel"`` or ``"abs"``.
 
         Raises:
-            DeskError: Unknown mode; an action of the wrong shape or with a value that is not finite.
+            DeskError: Unknown mode; an action of the wrong shape, with a value that is not finite, or over
+                :data:`LARGEST`. Relative actions beyond 1 are executed as they are, as in CALVIN.
             SimulationError: The physics diverged; reset before going on.
         """
         self._require_open()
@@ -275,7 +283,10 @@ class Desk:
         still = camera == "static"
         view = static_view() if still else gripper_view(*self._robot.camera_pose())
         lens = CAMERAS[camera]
-        return self._renderer.draw(lens, view, size or lens.size, self._table.light_colors(), keep=still)
+        pixels = lens.size if size is None else size
+        if not isinstance(pixels, int | np.integer) or pixels < 1:
+            raise DeskError(f"size must be a positive number of pixels, got {size!r}")
+        return self._renderer.draw(lens, view, int(pixels), self._table.light_colors(), keep=still)
 
     def _advance(self, action: np.ndarray, control_mode: str) -> None:
         self._actions.append((action, control_mode))
@@ -348,9 +359,14 @@ def _distance(camera: str, inverse: np.ndarray) -> np.ndarray:
 
 
 def _vector(values: Any, length: int, name: str) -> np.ndarray:
-    array = np.array(values, dtype=np.float64)
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DeskError(f"{name} must be {length} numbers, got {values!r}") from None
     if array.shape != (length,):
         raise DeskError(f"{name} must have shape ({length},), got {array.shape}")
     if not np.isfinite(array).all():
         raise DeskError(f"{name} must be finite, got {array.tolist()}")
+    if np.abs(array).max() > LARGEST:
+        raise DeskError(f"{name} must lie within +-{LARGEST:g} in every component, got {array.tolist()}")
     return array

@@ -7,7 +7,7 @@ import pytest
 from dataset_convert.calvin import CalvinSplit
 from lerobot_lansar.demos import play
 from lerobot_lansar.demos.demonstrator import relative_action
-from lerobot_lansar.desk import DeskError
+from lerobot_lansar.desk import Desk, DeskError, SimulationError
 
 
 def test_keys_press_the_button_and_the_video_shows_the_verdict(tmp_path, capsys):
@@ -53,6 +53,39 @@ def test_enter_keeps_demonstrations_that_fulfil_a_task(tmp_path):
         play.play(config)
 
 
+def test_a_task_that_was_undone_is_not_kept(tmp_path):
+    config = play.PlayConfig(
+        keys="enter a8 w6 f7 wait4 r4 f5 wait5 r4 enter",
+        output_dir=tmp_path / "mine",
+        video=tmp_path / "v.mp4",
+    )
+    session = play.play(config)
+    assert not session.fulfilled
+    assert not session.kept
+    assert not (tmp_path / "mine" / "training").exists()
+
+
+def test_what_was_kept_survives_a_session_that_breaks_off(tmp_path, monkeypatch):
+    begin = play.Session.begin
+
+    def breaks_off(session):
+        if session.kept:
+            raise SimulationError("diverged")
+        begin(session)
+
+    monkeypatch.setattr(play.Session, "begin", breaks_off)
+    with pytest.raises(SimulationError):
+        play.play(
+            play.PlayConfig(
+                keys="enter a8 w6 f7 wait4 r4 enter backspace wait",
+                output_dir=tmp_path / "mine",
+                video=tmp_path / "v.mp4",
+            )
+        )
+    assert len(CalvinSplit(tmp_path / "mine", "training").windows) == 1
+    assert not (tmp_path / "v.mp4").exists()
+
+
 def test_the_window_takes_keys(monkeypatch, tmp_path):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame = play.open_window()
@@ -77,9 +110,13 @@ def test_the_window_takes_keys(monkeypatch, tmp_path):
     monkeypatch.setattr(pygame.key, "get_pressed", Held)
     monkeypatch.setattr(pygame.event, "get", events)
     monkeypatch.setattr(play, "open_window", lambda: pygame)
-    session = play.play(play.PlayConfig(task="open_drawer", seed=1, video=tmp_path / "v.mp4"))
-    assert session.obs["robot_obs"][0] - session._rows[0]["robot_obs"][0] > 0.1
-    assert session.obs["robot_obs"][14] == -session._rows[0]["actions"][6]
+    config = play.PlayConfig(task="open_drawer", seed=1, video=tmp_path / "v.mp4")
+    with Desk("D") as desk:
+        start = play.Session(config, desk).obs
+    session = play.play(config)
+    assert session.steps == 14
+    assert session.obs["robot_obs"][0] - start["robot_obs"][0] > 0.1
+    assert session.obs["robot_obs"][14] == -start["robot_obs"][14]
 
 
 def test_without_a_display_keys_are_played(monkeypatch, tmp_path, capsys):

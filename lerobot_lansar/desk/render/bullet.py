@@ -1,6 +1,9 @@
 """PyBullet's own two renderers: the reference for ours, and slower."""
 
 import importlib.util
+import subprocess
+import sys
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -9,6 +12,7 @@ import pybullet as p
 from ..cameras import Camera
 from ..errors import DeskError
 
+_PLUGIN = "_eglRendererPlugin"
 Colors = dict[tuple[int, int], tuple[float, ...]]
 
 
@@ -60,6 +64,16 @@ class BulletRenderer:
         return picture, ((far - (far - near) * buffer) / (far * near)).astype(np.float32)
 
 
+@cache
+def _egl_works(plugin: str) -> bool:
+    """Tried in another process: without a driver the plugin ends the one that loads it."""
+    code = (
+        "import pybullet as p, sys; p.connect(p.DIRECT); sys.exit(p.loadPlugin(sys.argv[1], sys.argv[2]) < 0)"
+    )
+    command = [sys.executable, "-c", code, plugin, _PLUGIN]
+    return subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+
+
 def load_egl(client: int) -> int:
     """Loads the EGL plugin, which must happen before anything is loaded into the client; returns its id.
 
@@ -67,7 +81,8 @@ def load_egl(client: int) -> int:
         DeskError: The plugin, EGL or a driver for it is missing.
     """
     found = importlib.util.find_spec("eglRenderer")
-    plugin = p.loadPlugin(found.origin, "_eglRendererPlugin", physicsClientId=client) if found else -1
+    works = found is not None and found.origin is not None and _egl_works(found.origin)
+    plugin = p.loadPlugin(found.origin, _PLUGIN, physicsClientId=client) if works and found else -1
     if plugin < 0:
         raise DeskError(
             "renderer egl: pybullet's EGL plugin could not be loaded; it needs an OpenGL driver with EGL (Debian and "

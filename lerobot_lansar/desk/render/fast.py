@@ -14,6 +14,9 @@ from . import raster
 from .bullet import Colors
 from .stage import Group, Stage
 
+BACKDROPS = 3
+"""Standing cameras and sizes whose backdrops are kept, some MB each."""
+
 
 class FastRenderer:
     """Draws a stage; its subclasses say how light falls.
@@ -83,6 +86,8 @@ class FastRenderer:
         """A painting of what has not moved since the last picture of this camera, and the groups it lacks."""
         key = size, lens.tobytes()
         if key not in self._backdrops:
+            if len(self._backdrops) >= BACKDROPS:  # a picture of another size than usual: forget the oldest
+                del self._backdrops[next(iter(self._backdrops))]
             bottom = _Layer(self._blank(size), np.zeros((size, size), np.float32), poses.copy(), colors, [])
             self._paint(self._still, lens, camera, poses, {}, bottom.canvas, bottom.closeness)
             self._backdrops[key] = bottom, bottom

@@ -63,7 +63,7 @@ def nearest(faces, first, last, screen, behind, limits, smallest, rule, closenes
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if behind and (screen[a, 2] <= 0 or screen[b, 2] <= 0 or screen[c, 2] <= 0):
             if screen[a, 2] > limits[0] or screen[b, 2] > limits[0] or screen[c, 2] > limits[0]:
-                _clipped(f, a, b, c, screen, limits[0], smallest, rule, closeness, ids)
+                _clipped(f, a, b, c, screen, limits, smallest, rule, closeness, ids)
             continue
         xa, ya = screen[a, 0], screen[a, 1]
         xb, yb = screen[b, 0], screen[b, 1]
@@ -114,8 +114,9 @@ def _fill(f, xa, ya, wa, xb, yb, wb, xc, yc, wc, x0, x1, y0, y1, near, far, rule
 
 
 @njit(cache=True, error_model="numpy")
-def _clipped(f, a, b, c, screen, near, smallest, rule, closeness, ids):  # type: ignore[no-untyped-def]
+def _clipped(f, a, b, c, screen, limits, smallest, rule, closeness, ids):  # type: ignore[no-untyped-def]
     """A face that reaches behind the eye: what is left of it beyond the near plane."""
+    near = limits[0]
     polygon = np.empty((4, 3), np.float32)
     count = 0
     corners = (a, b, c)
@@ -141,7 +142,7 @@ def _clipped(f, a, b, c, screen, near, smallest, rule, closeness, ids):  # type:
         y0 = int(np.ceil(max(min(pa[1], pb[1], pc[1]), 0)))
         y1 = int(np.floor(min(max(pa[1], pb[1], pc[1]), size - 1)))
         _fill(
-            f, pa[0], pa[1], pa[2], pb[0], pb[1], pb[2], pc[0], pc[1], pc[2], x0, x1, y0, y1, np.inf, 0,
+            f, pa[0], pa[1], pa[2], pb[0], pb[1], pb[2], pc[0], pc[1], pc[2], x0, x1, y0, y1, np.inf, 1 / limits[1],
             rule, closeness, ids,
         )  # fmt: skip
 

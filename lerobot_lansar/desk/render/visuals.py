@@ -141,6 +141,9 @@ def _load_obj(path: Path) -> Mesh:
         raise DeskError(f"{path} cannot be read as OBJ: {error}") from error
     # In the file's order (they come last first): of two faces in one place it decides which one is seen.
     pieces = list(loaded["geometry"].values())[::-1] if "geometry" in loaded else [loaded]
+    pieces = [piece for piece in pieces if len(piece.get("faces", ()))]
+    if not pieces:
+        raise DeskError(f"{path} holds no faces; is it a Git LFS pointer instead of the file?")
     faces, points, normals, uvs, count = [], [], [], [], 0
     for piece in pieces:
         corners, vertices = np.asarray(piece["faces"]), np.asarray(piece["vertices"], np.float32)
@@ -179,7 +182,10 @@ def _shared(width: int, height: int, pixels: bytes) -> np.ndarray:
 
 
 def _load_stl(path: Path) -> Mesh:
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DeskError(f"{path} cannot be read: {error}") from error
     count = int.from_bytes(data[80:84], "little")
     if len(data) != 84 + 50 * count:
         raise DeskError(f"{path} is no binary STL file: {len(data)} bytes, expected {84 + 50 * count}")
