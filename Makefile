@@ -8,7 +8,7 @@ help:
 	@echo "make test         environment, all tests"
 	@echo "make install      environment only: .venv with the plugin installed editable"
 	@echo "make lint         ruff and mypy"
-	@echo "make benchmarks   the speed tables of docs/benchmarks.md"
+	@echo "make benchmarks   the speed tables of docs/benchmarks.md; ASSETS=DIR for those on CALVIN's files too"
 
 install: .venv/.installed
 
@@ -28,6 +28,7 @@ lint: install
 
 benchmarks: install
 	.venv/bin/python benchmarks/desk.py --output=outputs/benchmarks/desk.json
+	$(if $(ASSETS),.venv/bin/python benchmarks/desk.py --assets=$(ASSETS) --output=outputs/benchmarks/desk_original.json)
 	.venv/bin/python benchmarks/policy_latency.py --output=outputs/benchmarks/policy_latency.json
 	.venv/bin/python benchmarks/training.py --output=outputs/benchmarks/training.json
 

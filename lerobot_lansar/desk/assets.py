@@ -1,5 +1,6 @@
 """Where a desk's bodies come from: a CALVIN checkout's ``data`` folder, or URDFs generated from a scene's numbers."""
 
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +10,8 @@ from pathlib import Path
 from . import builtin
 from .errors import DeskError
 from .scenes import Scene
+
+_LFS = b"version https://git-lfs"
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,27 @@ def _original(scene: Scene, folder: Path) -> Assets:
         temporary=False,
     )
     for file in (assets.robot, assets.desk, assets.plane, *assets.blocks.values()):
-        if not file.is_file():
-            raise DeskError(
-                f"asset file {file} is missing; assets must name the `data` folder of a calvin_env checkout "
-                f"(it holds franka_panda/, blocks/, plane/ and calvin_table_{scene.name}/), or be left out for "
-                "the built-in desk"
-            )
+        _check(file, scene)
+        for mesh in sorted(set(re.findall(r'filename="([^"]+)"', file.read_text()))):
+            _check(file.parent / mesh.removeprefix("package://"), scene)
     return assets
+
+
+def _check(file: Path, scene: Scene) -> None:
+    """Bullet says nothing of a missing texture, and loads a Git LFS pointer as an empty mesh."""
+    if not file.is_file():
+        raise DeskError(
+            f"asset file {file} is missing; assets must name the `data` folder of a calvin_env checkout "
+            f"(it holds franka_panda/, blocks/, plane/ and calvin_table_{scene.name}/), or be left out for "
+            "the built-in desk"
+        )
+    with file.open("rb") as content:
+        if content.read(len(_LFS)) == _LFS:
+            raise DeskError(
+                f"asset file {file} is a Git LFS pointer: run `git lfs pull` in the calvin_env checkout"
+            )
+    material = file.with_suffix(".mtl")
+    if file.suffix.lower() == ".obj" and material.is_file():
+        for texture in re.findall(r"^\s*map_Kd\s+(\S+)", material.read_text(), re.MULTILINE):
+            if "\\" not in texture:  # some collision meshes name a picture on their author's disk
+                _check(file.parent / texture, scene)

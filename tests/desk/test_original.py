@@ -2,13 +2,16 @@
 
 import gzip
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pybullet as p
 import pytest
 from PIL import Image
 
-from lerobot_lansar.desk import COLORS, SCENES, TASKS, BlockState, Desk, Snapshot, completed_tasks
+from lerobot_lansar.desk import COLORS, SCENES, TASKS, BlockState, Desk, DeskError, Snapshot, completed_tasks
 
 EXCEPTION = "slider_A"
 """The one recording of 68 that is not repeated bit for bit: from its 173rd frame on, pushing the slide, joints differ
@@ -64,6 +67,28 @@ def test_trajectories_and_their_tasks_are_the_originals(golden, original_assets,
         assert missing <= OTHER_OUTCOMES.get((name, start), set())
         for task in first.keys() - missing:
             assert abs(first[task] - segment["first_success"][task]) <= TOLERANCE
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_built_in_desk_has_the_originals_joints_and_extents(golden, scene):
+    facts = json.loads((golden / "facts.json").read_text())["scenes"][scene]
+    with Desk(scene, cameras=()) as desk:
+        client, body = desk._client, desk._table.body
+        for joint in range(p.getNumJoints(body, physicsClientId=client)):
+            p.resetJointState(body, joint, 0, physicsClientId=client)
+        p.performCollisionDetection(physicsClientId=client)
+        for name, box in facts["aabb"].items():
+            if name in desk._table.links:
+                mine = p.getAABB(body, desk._table.links[name], physicsClientId=client)
+                np.testing.assert_allclose(mine, box, atol=0.005, err_msg=name)
+        for name, joint in facts["joints"].items():
+            info = p.getJointInfo(body, joint["index"], physicsClientId=client)
+            state = p.getLinkState(body, joint["index"], computeForwardKinematics=1, physicsClientId=client)
+            axes = np.array(p.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+            assert info[1].decode() == name
+            np.testing.assert_allclose(info[8:10], joint["limits"], atol=1e-6)
+            np.testing.assert_allclose(state[4], joint["origin"], atol=1e-4)
+            np.testing.assert_allclose(axes @ info[13], joint["axis_world"], atol=1e-4)
 
 
 def test_all_initial_states_are_reached(golden, original_assets):
@@ -128,6 +153,31 @@ def test_oracle_answers_every_recorded_pair_as_the_original_did(golden):
 
 def test_tasks_are_calvins_in_calvins_order(golden):
     assert list(TASKS) == [task["task"] for task in json.loads((golden / "tasks.json").read_text())]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("calvin_table_D/meshes/led_link.STL", None, r"led_link\.STL is missing"),
+        ("calvin_table_D/textures/dark_wood.png", None, r"dark_wood\.png is missing"),
+        (
+            "calvin_table_D/meshes/base_link.obj",
+            "version https://git-lfs.github.com/spec/v1\n",
+            "git lfs pull",
+        ),
+    ],
+)
+def test_missing_and_unfetched_files_are_named(original_assets, tmp_path, name, content, message):
+    folder = tmp_path / "data"
+    shutil.copytree(original_assets, folder, copy_function=os.symlink)
+    for path in (folder, *folder.rglob("*")):
+        if path.is_dir():
+            path.chmod(0o755)
+    (folder / name).unlink()
+    if content:
+        (folder / name).write_text(content)
+    with pytest.raises(DeskError, match=message):
+        Desk("D", folder, cameras=())
 
 
 TAGS = [f"{scene}_{state}" for scene in "ABCD" for state in ("0_on", "0_off", "1_on", "1_off")]
