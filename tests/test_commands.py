@@ -87,8 +87,8 @@ def test_lansar_evaluates_the_same_with_any_batch_size(run, work, lansar):
         for d in ("results1", "results3")
     ]
     assert all(episodes[0][seed] == episodes[1][seed] for seed in range(4))
-    # The motion itself, seen through the videos. Products of different batch sizes round differently, contact makes that
-    # grow, and the encoder looks ahead: equal to the eye, not to the bit. Different episodes differ by over 10.
+    # The motion itself, seen through the videos. Products of different batch sizes round differently, contact makes
+    # that grow, and the encoder looks ahead: equal to the eye, not to the bit. Different episodes differ by over 10.
     films = [[film(work / f"eval{size}", k) for k in range(4)] for size in (1, 3)]
     for one, three in zip(*films, strict=True):
         assert one.shape == three.shape
