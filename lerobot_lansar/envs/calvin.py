@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from ..desk import CONTROL_HZ, TASKS, Desk, DeskError
+from ..desk import CONTROL_HZ, TASKS, Desk, DeskError, Observation, SimulationError
 from ..desk.cameras import CAMERAS
 from ..desk.commands import load_commands
 from ..desk.oracle import Snapshot
@@ -52,7 +52,8 @@ class CalvinEnv(gym.Env):
         the environment's own generator decides.
 
     Episode end: terminated when the last command is fulfilled or a command is not fulfilled within
-        ``steps_per_command`` control steps (360 in CALVIN).
+        ``steps_per_command`` control steps (360 in CALVIN). An episode whose simulation diverges ends as failed, with
+        the last finite observation.
 
     Args:
         task: ``"lh_mtlc"`` or one of the 34 tasks.
@@ -119,6 +120,8 @@ class CalvinEnv(gym.Env):
         self._max_episode_steps = steps_per_command * (CHAIN_LENGTH if task == LH_MTLC else 1)
         self._desk: Desk | None = None  # opened at the first reset, in the process that steps it
         self._commands: tuple[str, ...] = ()
+        self._diverged = False
+        self._last: Observation = {}
         self._done: list[dict[str, Any]] = []
         self.task_description = "" if task == LH_MTLC else self._sentences[task][0]
         self.observation_space = _observation_space(tuple(cameras))
@@ -131,6 +134,7 @@ class CalvinEnv(gym.Env):
         super().reset(seed=seed)
         if self._desk is None:
             self._desk = Desk(**self._desk_options)  # type: ignore[arg-type]
+        self._diverged = False
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         if self.task == LH_MTLC:
             chains = load_chains()
@@ -143,6 +147,7 @@ class CalvinEnv(gym.Env):
             self._commands = (self.task,)
             start = sample_start(self._desk, self.task, np.random.default_rng(self._seed))
             obs = self._desk.reset(*start)
+        self._last = obs
         self._done = []
         self._picture: tuple[int, np.ndarray] | None = (
             None  # the step it was drawn at, and the static picture
@@ -162,11 +167,14 @@ class CalvinEnv(gym.Env):
             raise DeskError("reset the environment before stepping it")
         if self._steps == 0:
             self._refuse_other_mode(np.asarray(action, dtype=np.float64))
-        obs = self._desk.step(action, self.control_mode)
+        try:
+            self._last = self._desk.step(action, self.control_mode)
+        except SimulationError:  # costs this episode only; the next reset starts the desk anew
+            self._diverged = True
         self._steps += 1
         self._command_steps += 1
-        fulfilled = TASKS[self._current](self._start, self._desk.snapshot())
-        failed = not fulfilled and self._command_steps >= self.steps_per_command
+        fulfilled = not self._diverged and TASKS[self._current](self._start, self._desk.snapshot())
+        failed = self._diverged or (not fulfilled and self._command_steps >= self.steps_per_command)
         if fulfilled or failed:
             self._done.append(
                 {
@@ -183,12 +191,14 @@ class CalvinEnv(gym.Env):
             self._commands = ()
         elif fulfilled:
             self._begin_command()
-        return self._observation(obs), float(fulfilled), finished, False, info
+        return self._observation(self._last), float(fulfilled), finished, False, info
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The static camera's picture, (200, 200, 3) uint8."""
         if self._desk is None:
             raise DeskError("reset the environment before rendering it")
+        if self._diverged and self._picture is not None:
+            return self._picture[1]
         if self._picture is None or self._steps - self._picture[0] >= self._redraw_every:
             self._picture = (self._steps, self._desk.render("static"))
         return self._picture[1]

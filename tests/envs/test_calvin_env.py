@@ -4,6 +4,7 @@ import json
 
 import gymnasium
 import numpy as np
+import pybullet
 import pytest
 from gymnasium.utils.env_checker import check_env
 
@@ -127,6 +128,23 @@ def test_actions_of_the_other_control_mode_are_refused_at_once():
     env.reset(seed=0)
     with pytest.raises(DeskError, match=r"--env\.control_mode=rel"):
         env.step([0.3, -0.2, 0.9, 0, 0, 0.4, 1])
+    env.close()
+
+
+def test_a_diverged_episode_fails_and_the_next_one_is_as_ever():
+    env = CalvinEnv("turn_on_led", cameras=())
+    first, _ = env.reset(seed=3)
+    env.render()
+    red = env._desk._blocks["red"].body
+    pybullet.resetBaseVelocity(red, [np.inf, 0, 0], physicsClientId=env._desk._client)
+    obs, reward, terminated, _, info = env.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    assert terminated
+    assert reward == 0
+    assert not info["is_success"]
+    assert np.isfinite(obs["environment_state"]).all()
+    assert env.render().shape == (200, 200, 3)
+    again, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(again["environment_state"], first["environment_state"])
     env.close()
 
 

@@ -135,8 +135,8 @@ def _clipped(f, a, b, c, screen, limits, smallest, rule, closeness, ids):  # typ
     size = closeness.shape[0]
     for k in range(1, count - 1):
         pa, pb, pc = polygon[0], polygon[k], polygon[k + 1]
-        if (pb[0] - pa[0]) * (pc[1] - pa[1]) - (pc[0] - pa[0]) * (pb[1] - pa[1]) <= smallest:
-            continue
+        if not (pb[0] - pa[0]) * (pc[1] - pa[1]) - (pc[0] - pa[0]) * (pb[1] - pa[1]) > smallest:
+            continue  # not a number neither: a corner exactly beside the eye
         x0 = int(np.ceil(max(min(pa[0], pb[0], pc[0]), 0)))
         x1 = int(np.floor(min(max(pa[0], pb[0], pc[0]), size - 1)))
         y0 = int(np.ceil(max(min(pa[1], pb[1], pc[1]), 0)))
