@@ -1,0 +1,231 @@
+"""What skills are made of: waypoints, what a skill sees of the desk, and the few moves that all of them share.
+
+Positions in metres in the world frame, angles in radians. A hand that points straight down has euler (pi, 0, yaw);
+:func:`pointing` leans it.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..desk import COLORS
+from ..desk.robot import BASE_POSITION
+from ..desk.scenes import BLOCK_LENGTHS, BLOCK_SIDE, Scene
+
+OPEN, CLOSED = 1.0, -1.0
+FORWARD = np.pi / 2
+"""The yaw (rad) of a hand at rest: the gripper camera looks at the cabinet."""
+YAWS = (FORWARD - 2.0, FORWARD + 2.5)
+"""Yaws (rad) that the arm reaches everywhere over the table; beyond them its last joint ends."""
+INTO_CABINET = 0.5
+"""How far (rad) a hand leans forward to reach past the cabinet's lid and door."""
+TABLE_FRONT = -0.18
+"""y of the table's front edge (m): the drawer comes out from under it."""
+
+Skill = Callable[["View"], Iterator["Waypoint"]]
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Where the TCP goes next.
+
+    Attributes:
+        position: (3,) m.
+        euler: (3,) rad.
+        gripper: -1 closed, +1 open.
+        slow: Fraction of the episode's speed: under 1 while touching things.
+        tolerance: How near counts as there (m).
+        hold: Control steps to stay after arriving.
+        keep: Asked at every step; once it is false the way is given up and the skill looks anew.
+    """
+
+    position: np.ndarray
+    euler: np.ndarray
+    gripper: float
+    slow: float = 1.0
+    tolerance: float = 0.012
+    hold: int = 0
+    keep: Callable[[], bool] | None = None
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a demonstrator moves in one episode.
+
+    Attributes:
+        speed: Fraction of the top speed, 0.0095 m per control step and 0.024 rad.
+        cruise: Height (m) of the TCP on its way over the table.
+        yaw: Deviation (rad) of the hand's yaw where any will do.
+        side: -1 or 1, the side that is preferred where both do.
+        idle_gripper: Open or closed on the way to what needs no particular one.
+        pauses: Probability of waiting up to 8 steps at a waypoint.
+        spread: 0 to 1, how far contact points and approach heights scatter.
+    """
+
+    speed: float = 0.9
+    cruise: float = 0.58
+    yaw: float = 0.0
+    side: float = 1.0
+    idle_gripper: float = CLOSED
+    pauses: float = 0.0
+    spread: float = 0.0
+
+    @classmethod
+    def sample(cls, rng: np.random.Generator, variety: float) -> "Style":
+        """A random style; ``variety`` from 0 (always the same) to 1."""
+        return cls(
+            speed=0.9 + variety * rng.uniform(-0.25, 0.1),
+            cruise=0.58 + variety * rng.uniform(-0.01, 0.06),
+            yaw=variety * rng.uniform(-0.2, 0.2),
+            side=1.0 if rng.uniform() < 1 - 0.5 * variety else -1.0,
+            idle_gripper=CLOSED if rng.uniform() < 1 - 0.5 * variety else OPEN,
+            pauses=0.08 * variety,
+            spread=variety,
+        )
+
+
+@dataclass
+class View:
+    """What a skill sees: the scene's fixed numbers and the latest ``robot_obs`` (15,) and ``scene_obs`` (24,)."""
+
+    scene: Scene
+    robot_obs: np.ndarray
+    scene_obs: np.ndarray
+    rng: np.random.Generator
+    style: Style = field(default_factory=Style)
+
+    @property
+    def tcp(self) -> np.ndarray:
+        """TCP position, (3,) m."""
+        return self.robot_obs[:3]
+
+    @property
+    def drawer(self) -> float:
+        """How far the drawer is open (m)."""
+        return float(self.scene_obs[1])
+
+    def block(self, color: str) -> np.ndarray:
+        """Pose of a block: xyz (m), euler (rad); (6,)."""
+        index = 6 + 6 * COLORS.index(color)
+        return self.scene_obs[index : index + 6]
+
+    def length(self, color: str) -> float:
+        """A block's longest side (m)."""
+        return BLOCK_LENGTHS[self.scene.blocks[color]]
+
+    def others(self, color: str) -> list[np.ndarray]:
+        """Poses of the other blocks."""
+        return [self.block(other) for other in COLORS if other != color]
+
+    def holds(self, color: str) -> bool:
+        """Whether the closed hand has the block between its fingers."""
+        near = np.linalg.norm(self.block(color)[:3] - self.tcp) < 0.045
+        return bool(near and self.robot_obs[14] < 0 and self.robot_obs[6] > 0.02)
+
+    def held(self) -> str | None:
+        """The block in the hand, if there is one."""
+        return next((color for color in COLORS if self.holds(color)), None)
+
+    def scatter(self, spread: float) -> float:
+        """A random number within +-``spread`` (m or rad), less when the style asks for less variety."""
+        return float(self.rng.uniform(-spread, spread) * self.style.spread)
+
+    def go(
+        self,
+        position: np.ndarray | tuple[float, float, float],
+        gripper: float = CLOSED,
+        euler: np.ndarray | None = None,
+        **options: float | Callable[[], bool] | None,
+    ) -> Waypoint:
+        """A waypoint; without ``euler`` the hand points down and leans outward where the arm has to stretch."""
+        xyz = np.asarray(position, float)
+        if euler is None:
+            euler = pointing(FORWARD + self.style.yaw, *stretch(xyz))
+        return Waypoint(xyz, euler, gripper, **options)  # type: ignore[arg-type]
+
+
+def pointing(yaw: float, lean_x: float = 0.0, lean_y: float = 0.0) -> np.ndarray:
+    """Euler angles (3,) of a hand that points down with ``yaw`` and then leans outward by (lean_x, lean_y) rad."""
+    down = Rotation.from_euler("xyz", [np.pi, 0.0, yaw])
+    return (Rotation.from_rotvec([lean_y, -lean_x, 0.0]) * down).as_euler("xyz")
+
+
+def approach(euler: np.ndarray) -> np.ndarray:
+    """The direction in which the fingers point, (3,)."""
+    return Rotation.from_euler("xyz", euler).apply([0.0, 0.0, 1.0])
+
+
+def stretch(position: np.ndarray) -> np.ndarray:
+    """How far (rad, along x and y) the hand must lean outward for the arm to reach a point at table height.
+
+    Straight down the arm reaches 0.76 m from its base, leaning by 0.55 rad 0.88 m.
+    """
+    way = position[:2] - np.array(BASE_POSITION[:2])
+    distance = float(np.linalg.norm(way))
+    return way / distance * np.clip((distance - 0.74) / 0.12, 0, 1) * 0.5
+
+
+def turned(yaw: float) -> float:
+    """The same yaw in the interval that the last joint passes through without turning back: [FORWARD - 2.2, +4.1)."""
+    return float((yaw - FORWARD + 2.2) % (2 * np.pi) - 2.2 + FORWARD)
+
+
+def in_cabinet(position: np.ndarray) -> bool:
+    """Whether a TCP there is among the cabinet's walls."""
+    return bool(position[1] > -0.02 and position[2] < 0.64)
+
+
+def retreat(view: View, gripper: float, keep: Callable[[], bool] | None = None) -> Iterator[Waypoint]:
+    """Out of the cabinet the way the fingers came in, up from anything low."""
+    options = {"tolerance": 0.03, "keep": keep}
+    if in_cabinet(view.tcp):
+        back = view.tcp - 0.12 * approach(view.robot_obs[3:6])
+        yield view.go(back, gripper, view.robot_obs[3:6].copy(), **options)
+        yield view.go((view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.robot_obs[3:6].copy(), **options)
+    elif view.tcp[2] < view.style.cruise - 0.03:
+        above = (view.tcp[0], min(view.tcp[1], -0.05), view.style.cruise)
+        yield view.go(above, gripper, view.robot_obs[3:6].copy(), **options)
+
+
+def travel(
+    view: View,
+    position: np.ndarray | tuple[float, float, float],
+    gripper: float,
+    euler: np.ndarray | None = None,
+    keep: Callable[[], bool] | None = None,
+) -> Iterator[Waypoint]:
+    """Over everything to a place above ``position``; ends at cruising height or at the place if that is higher."""
+    x, y, z = position
+    if np.linalg.norm(view.tcp[:2] - [x, y]) > 0.04 or in_cabinet(view.tcp):
+        yield from retreat(view, gripper, keep)
+        yield view.go((x, y, max(z, view.style.cruise)), gripper, euler, tolerance=0.03, keep=keep)
+
+
+def lying(pose: np.ndarray) -> tuple[float, bool]:
+    """Yaw (rad) of a block's long axis, and whether that axis is horizontal; of another axis if the block stands."""
+    axes = Rotation.from_euler("xyz", pose[3:]).as_matrix()
+    horizontal = bool(abs(axes[2, 0]) < 0.7)
+    axis = axes[:, 0] if horizontal else axes[:, 1]
+    return float(np.arctan2(axis[1], axis[0])), horizontal
+
+
+def grasp_yaws(view: View, color: str) -> list[float]:
+    """Yaws that close the fingers on a block, the handiest first; none that the wrist does not reach.
+
+    The fingers fit over sides of up to 0.056 m.
+    """
+    pose = view.block(color)
+    yaw, horizontal = lying(pose)
+    only_short = horizontal and view.length(color) > 0.06
+    yaws = {turned(yaw + k * np.pi / 2) for k in range(4) if k % 2 == 0 or not only_short}
+    now = turned(view.robot_obs[5])
+
+    def badness(candidate: float) -> float:
+        # the hand is 0.2 m wide across its fingers: near the cabinet it must stand along it
+        sideways = abs(np.sin(candidate - FORWARD)) * (3.0 if pose[1] > -0.10 else 0.5)
+        long_side = 0.5 * (horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE)
+        return abs(candidate - now) + sideways + long_side
+
+    return sorted((y for y in yaws if YAWS[0] <= y <= YAWS[1]), key=badness)
