@@ -12,9 +12,9 @@ from .motion import Disturbance, Motion, relative_action
 from .moves import Style, View, Waypoint
 from .skills import SKILLS
 
-MAX_STEPS = 300
+MAX_STEPS = 360
 AFTERWARDS = 2
-"""Frames kept after the oracle was satisfied."""
+"""The oracle must be satisfied in one frame and in so many after it; then a demonstration ends."""
 _PATIENCE = 12  # control steps without progress after which the next waypoint is due
 _TURN_TOLERANCE = 0.12  # rad
 
@@ -46,7 +46,7 @@ def carry_out(
     steps: int,
     fulfilled: Callable[[], bool],
 ) -> Iterator[tuple[dict[str, np.ndarray], Observation]]:
-    """Does ``task`` from the present state; ends :data:`AFTERWARDS` frames after ``fulfilled``, or at the skill's end.
+    """Does ``task`` from the present state; ends once it is and stays ``fulfilled``, or at the skill's end.
 
     Args:
         desk: In the state that ``obs`` shows.
@@ -63,6 +63,7 @@ def carry_out(
     view = View(desk.scene, obs["robot_obs"], obs["scene_obs"], rng, Style.sample(rng, variety))
     motion = Motion(obs["robot_obs"], view.style.speed)
     disturbance = Disturbance(noise, rng)
+    stays = 0
     for waypoint in SKILLS[task](view):
         pause = int(rng.integers(1, 9)) if rng.uniform() < view.style.pauses else 0
         best, stalled, held = np.inf, 0, 0
@@ -80,8 +81,9 @@ def carry_out(
             view.robot_obs, view.scene_obs = obs["robot_obs"], obs["scene_obs"]
             steps -= 1
             yield frame, obs
-            if steps > AFTERWARDS and fulfilled():
-                steps = AFTERWARDS
+            stays = stays + 1 if fulfilled() else 0
+            if stays > AFTERWARDS:
+                return
             error = distance + 0.1 * turn
             stalled = 0 if error < best - 1e-3 else stalled + 1
             best = min(best, error)

@@ -71,7 +71,7 @@ class Motion:
         left = _difference(target, self._plan)
         top = self._speed * waypoint.slow
         self._velocity[:3] = _accelerate(self._velocity[:3], left[:3], TOP_SPEED * top, ACCELERATION)
-        self._velocity[3:] = _accelerate(self._velocity[3:], left[3:], TOP_TURN * self._speed, TURN_ACCELERATION)
+        self._velocity[3:] = _accelerate(self._velocity[3:], left[3:], TOP_TURN * (1 + self._speed) / 2, TURN_ACCELERATION)
         self._plan = self._plan + self._velocity
         step = np.array([POSITION_STEP] * 3 + [ANGLE_STEP] * 3)
         command = np.clip(self._velocity / RESPONSE + ahead, -step, step)
@@ -107,7 +107,7 @@ class Disturbance:
         if self._pushed == 0 and self._rng.uniform() < 0.025:
             self._push, self._pushed = self._rng.normal(0, 4 * self._noise, 6), 4
         if self._slipped == 0 and self._rng.uniform() < 0.005 * self._noise:
-            self._slipped = 3
+            self._slipped = 1
         units = self._rng.normal(0, self._noise, 6) + (self._push if self._pushed else 0.0)
         gripper = -action[6:] if self._slipped else action[6:]
         self._pushed, self._slipped = max(self._pushed - 1, 0), max(self._slipped - 1, 0)

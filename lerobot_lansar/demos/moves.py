@@ -124,6 +124,10 @@ class View:
         near = np.linalg.norm(self.block(color)[:3] - self.tcp) < 0.045
         return bool(near and self.robot_obs[14] < 0 and self.robot_obs[6] > 0.02)
 
+    def lost(self, color: str) -> bool:
+        """Whether the block fell off the desk."""
+        return bool(self.block(color)[2] < 0.30)
+
     def held(self) -> str | None:
         """The block in the hand, if there is one."""
         return next((color for color in COLORS if self.holds(color)), None)
@@ -198,6 +202,8 @@ def travel(
 ) -> Iterator[Waypoint]:
     """Over everything to a place above ``position``; ends at cruising height or at the place if that is higher."""
     x, y, z = position
+    if in_cabinet(view.tcp) and y > -0.02 and abs(view.tcp[0] - x) < 0.08:
+        return
     if np.linalg.norm(view.tcp[:2] - [x, y]) > 0.04 or in_cabinet(view.tcp):
         yield from retreat(view, gripper, keep)
         yield view.go((x, y, max(z, view.style.cruise)), gripper, euler, tolerance=0.03, keep=keep)

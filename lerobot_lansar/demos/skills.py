@@ -34,6 +34,8 @@ from .moves import (
 
 HANDLE_Z = 0.365
 """Height (m) at which the hand pulls and pushes the drawer's handle."""
+EDGE = 0.415
+"""|x| (m) up to which blocks are set down on the table, which ends at 0.44."""
 TRIES = 4
 """How often a skill begins anew before it gives up."""
 
@@ -136,17 +138,43 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
     """TCP position (3,) m and euler (3,) rad that take a block where it lies."""
     position = view.block(color)[:3] + [0.0, 0.0, 0.002]
     if in_cabinet(position):
-        left, right = view.scene.cabinet
-        # an open finger needs 0.062 m between the block's middle and the cabinet's wall
-        position[0] = np.clip(position[0], left + 0.062, right - 0.062)
+        position[0] = np.clip(position[0], *_finger_room(view, position[0]))
         return position, pointing(yaw, 0.0, INTO_CABINET)
-    if position[2] < TABLE_Z - 0.05:
-        return position + [0.0, 0.0, 0.008], pointing(yaw, *stretch(position))
+    if abs(position[2] - TABLE_Z) > 0.025:  # in the drawer, or on another block
+        position[2] += 0.008
     return position, pointing(yaw, *stretch(position))
+
+
+def _finger_room(view: View, x: float) -> tuple[float, float]:
+    """x (m) between which an open hand fits into the cabinet: its fingers reach out 0.067 m."""
+    low, high = open_part(view, x)
+    middle = (low + high) / 2
+    return min(low + 0.067, middle), max(high - 0.067, middle)
+
+
+def _coax(view: View, color: str) -> Iterator[Waypoint]:
+    """Slides a block that stands too near to a wall or to the door's edge inwards, with a fingertip on its top."""
+    for _ in range(3):
+        x, y = view.block(color)[:2]
+        low, high = _finger_room(view, x)
+        slack = 0.037 - _half_width(view, color, np.array([1.0, 0.0]))
+        aim = float(np.clip(x, low - slack, high + slack))
+        if abs(aim - x) < 0.002 or y > 0.16:
+            return
+        aim += 0.012 * np.sign(aim - x)
+        euler = pointing(FORWARD, 0.0, INTO_CABINET)
+        top = np.array([np.clip(x, low - 0.04, high + 0.04), y, view.block(color)[2] + BLOCK_SIDE / 2 + 0.016])
+        yield from travel(view, top - 0.14 * approach(euler), CLOSED, euler)
+        yield view.go(top - 0.05 * approach(euler), CLOSED, euler, tolerance=0.01)
+        yield view.go(top - [0, 0, 0.008], CLOSED, euler, slow=0.6, tolerance=0.005)
+        yield view.go(top + [aim - x, 0.0, -0.014], CLOSED, euler, slow=0.4, tolerance=0.006)
+        yield view.go(view.tcp - 0.1 * approach(euler), CLOSED, euler, tolerance=0.03)
 
 
 def _take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     """Brings the open hand around a block and closes it; ``turn`` (rad) is how far the wrist must turn afterwards."""
+    if in_cabinet(view.block(color)):
+        yield from _coax(view, color)
     yaws = grasp_yaws(view, color)
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw + turn <= YAWS[1]] or yaws
     if not yaws:
@@ -170,6 +198,8 @@ def _lift(color: str) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Take the block and raise it; take it again if it slipped."""
         for _ in range(TRIES):
+            if view.lost(color):
+                return
             if not view.holds(color):
                 yield from _take(view, color)
             back = view.robot_obs[3:6].copy()
@@ -184,7 +214,7 @@ def unstack_block(view: View) -> Iterator[Waypoint]:
     """Take the upper block and raise it."""
     for _ in range(TRIES):
         top = _top_of_stack(view) or view.held()
-        if top is None:
+        if top is None or view.lost(top):
             return
         if not view.holds(top):
             yield from _take(view, top)
@@ -227,7 +257,9 @@ def _last_held(view: View) -> str:
 def place_in_drawer(view: View) -> Iterator[Waypoint]:
     """Carry the block over the drawer, lower it and let go."""
     color = _last_held(view)
-    for _ in range(TRIES):
+    for _ in range(2 * TRIES):
+        if view.lost(color):
+            return
         if not view.holds(color):
             yield from _take(view, color)
             continue
@@ -241,7 +273,9 @@ def place_in_drawer(view: View) -> Iterator[Waypoint]:
 def place_in_slider(view: View) -> Iterator[Waypoint]:
     """Carry the block before the cabinet's open side, reach in with a leaning hand and let go."""
     color = _last_held(view)
-    for _ in range(TRIES):
+    for _ in range(2 * TRIES):
+        if view.lost(color):
+            return
         if not view.holds(color):
             yield from _take(view, color)
             continue
@@ -270,11 +304,13 @@ def _forward(view: View, color: str) -> float:
     return float(yaw if abs(yaw - FORWARD) < 0.3 else FORWARD + np.clip(yaw - FORWARD, -0.3, 0.3))
 
 
-def open_part(view: View) -> tuple[float, float]:
-    """x range (m) of the cabinet that the door leaves open: the wider one of the two sides."""
+def open_part(view: View, x: float | None = None) -> tuple[float, float]:
+    """x range (m) of the cabinet that the door leaves open: the side on which ``x`` is, or else the wider one."""
     left, right = view.scene.cabinet
     door = view.scene.slide_x - view.scene_obs[0]
     sides = ((left, door), (door + 0.28, right))
+    if x is not None:
+        return sides[int(x > door + 0.14)]
     return max(sides, key=lambda side: side[1] - side[0])
 
 
@@ -290,7 +326,9 @@ def _freest(view: View, color: str, places: list[np.ndarray]) -> np.ndarray:
 def stack_block(view: View) -> Iterator[Waypoint]:
     """Carry the block over another one, turn it the same way, lower it and let go."""
     color = _last_held(view)
-    for _ in range(TRIES):
+    for _ in range(2 * TRIES):
+        if view.lost(color):
+            return
         if not view.holds(color):
             yield from _take(view, color)
             continue
@@ -332,7 +370,7 @@ def _covered(view: View, color: str, in_hand: str) -> bool:
 
 def _rotate(color: str, direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
-        """Take the block, raise it a little, turn the wrist, set it down and let go."""
+        """Take the block where it lies, turn the wrist and let go; turn on if that was not far enough."""
         wanted = direction * (1.3 + view.scatter(0.1))
         start = lying(view.block(color))[0]
         origin = view.block(color)[:3].copy()
@@ -341,6 +379,8 @@ def _rotate(color: str, direction: float) -> Skill:
             return view.holds(color)
 
         for _ in range(TRIES):
+            if view.lost(color):
+                return
             done = (lying(view.block(color))[0] - start + np.pi) % (2 * np.pi) - np.pi
             left = wanted - done
             if not keep():
@@ -352,12 +392,10 @@ def _rotate(color: str, direction: float) -> Skill:
             ground = view.tcp.copy()
             # away from the cabinet, which a turned hand would hit; the oracle allows 0.1 m
             place = np.array([ground[0], min(ground[1], max(origin[1] - 0.085, -0.11)), ground[2]])
-            raised = place + [0.0, 0.0, 0.012 + abs(view.scatter(0.01))]
             lean = stretch(place)
-            yield view.go(ground + [0, 0, 0.012], CLOSED, view.robot_obs[3:6].copy(), slow=0.7, keep=keep)
-            yield view.go(raised, CLOSED, pointing((yaw + end) / 2, *lean), tolerance=0.02, keep=keep)
-            yield view.go(raised, CLOSED, pointing(end, *lean), tolerance=0.01, keep=keep)
-            yield view.go(place, CLOSED, pointing(end, *lean), slow=0.7, tolerance=0.005, keep=keep)
+            yield view.go(place, CLOSED, pointing(end, *lean), tolerance=0.01, keep=keep)
+            if not keep():
+                continue
             yield view.go(place, OPEN, pointing(end, *lean), tolerance=0.02, hold=4)
             yield view.go(place + [0, 0, 0.09], OPEN, pointing(end, *lean), tolerance=0.02)
 
@@ -415,6 +453,8 @@ def _push(color: str, direction: float) -> Skill:
         """Push the block along; carry it where the button's rim or another block is in the way."""
         begin = view.block(color)[0]
         for _ in range(TRIES):
+            if view.lost(color):
+                return
             pose = view.block(color)
             missing = 0.125 - direction * (pose[0] - begin)
             end = pose[0] + direction * max(missing, 0.03)
@@ -442,7 +482,7 @@ def _way_is_free(view: View, color: str, pose: np.ndarray, end: float) -> bool:
             reach_x = _half_width(view, name, np.array([1.0, 0.0]))
             if abs(other[1] - pose[1]) < reach_y and low < other[0] + reach_x and high > other[0] - reach_x:
                 return False
-    return bool(abs(end) < 0.37 and abs(low) < 0.44 and abs(high) < 0.44)
+    return bool(abs(end) < EDGE)
 
 
 def _landing(view: View, color: str, begin: float, direction: float) -> np.ndarray:
@@ -454,7 +494,7 @@ def _landing(view: View, color: str, begin: float, direction: float) -> np.ndarr
         for y in np.linspace(-0.14, -0.04, 6):
             x = begin + direction * step
             place = np.array([x, y])
-            if abs(x) > 0.36:
+            if abs(x) > EDGE:
                 continue
             if abs(x - view.scene.button_x) < radius + 0.05 and abs(y + 0.12) < radius + 0.05:
                 continue
