@@ -106,7 +106,7 @@ class Disturbance:
         """The action that is really executed, (7,)."""
         if self._pushed == 0 and self._rng.uniform() < 0.025:
             self._push, self._pushed = self._rng.normal(0, 4 * self._noise, 6), 4
-        if self._slipped == 0 and self._rng.uniform() < 0.005 * self._noise:
+        if self._slipped == 0 and self._rng.uniform() < 0.001 * self._noise:
             self._slipped = 1
         units = self._rng.normal(0, self._noise, 6) + (self._push if self._pushed else 0.0)
         gripper = -action[6:] if self._slipped else action[6:]

@@ -147,9 +147,10 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _finger_room(view: View, x: float) -> tuple[float, float]:
     """x (m) between which an open hand fits into the cabinet: its fingers reach out 0.067 m."""
+    reach = 0.075
     low, high = open_part(view, x)
     middle = (low + high) / 2
-    return min(low + 0.067, middle), max(high - 0.067, middle)
+    return min(low + reach, middle), max(high - reach, middle)
 
 
 def _coax(view: View, color: str) -> Iterator[Waypoint]:
@@ -167,7 +168,7 @@ def _coax(view: View, color: str) -> Iterator[Waypoint]:
         yield from travel(view, top - 0.14 * approach(euler), CLOSED, euler)
         yield view.go(top - 0.05 * approach(euler), CLOSED, euler, tolerance=0.01)
         yield view.go(top - [0, 0, 0.008], CLOSED, euler, slow=0.6, tolerance=0.005)
-        yield view.go(top + [aim - x, 0.0, -0.014], CLOSED, euler, slow=0.4, tolerance=0.006)
+        yield view.go(top + [aim - x, 0.0, -0.03], CLOSED, euler, slow=0.4, tolerance=0.006)
         yield view.go(view.tcp - 0.1 * approach(euler), CLOSED, euler, tolerance=0.03)
 
 
@@ -254,6 +255,13 @@ def _last_held(view: View) -> str:
     return view.held() or min(COLORS, key=lambda color: float(np.linalg.norm(view.block(color)[:3] - view.tcp)))
 
 
+def _fetch(view: View, color: str) -> Iterator[Waypoint]:
+    """Takes a block that slipped from the hand, once it has come to rest."""
+    yield view.go(view.tcp.copy(), OPEN, view.robot_obs[3:6].copy(), tolerance=0.05, hold=8)
+    if not view.lost(color):
+        yield from _take(view, color)
+
+
 def place_in_drawer(view: View) -> Iterator[Waypoint]:
     """Carry the block over the drawer, lower it and let go."""
     color = _last_held(view)
@@ -261,7 +269,7 @@ def place_in_drawer(view: View) -> Iterator[Waypoint]:
         if view.lost(color):
             return
         if not view.holds(color):
-            yield from _take(view, color)
+            yield from _fetch(view, color)
             continue
         y = (-0.157 - view.drawer + TABLE_FRONT) / 2
         places = [np.array([view.scene.drawer_x + x, y, 0.0]) for x in (0.0, 0.05, -0.05, 0.1, -0.1)]
@@ -277,7 +285,7 @@ def place_in_slider(view: View) -> Iterator[Waypoint]:
         if view.lost(color):
             return
         if not view.holds(color):
-            yield from _take(view, color)
+            yield from _fetch(view, color)
             continue
         low, high = open_part(view)
         middle, room = (low + high) / 2, max((high - low) / 2 - 0.07, 0.0)
@@ -330,7 +338,7 @@ def stack_block(view: View) -> Iterator[Waypoint]:
         if view.lost(color):
             return
         if not view.holds(color):
-            yield from _take(view, color)
+            yield from _fetch(view, color)
             continue
         base = _best_base(view, color)
         if base is None:
