@@ -139,32 +139,42 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
     position = view.block(color)[:3] + [0.0, 0.0, 0.002]
     if in_cabinet(position):
         position[0] = np.clip(position[0], *_finger_room(view, position[0]))
-        return position, pointing(yaw, 0.0, INTO_CABINET)
+        deep = np.clip(position[1] - 0.085, 0.0, 0.04)  # there the hand itself would touch the door
+        position[1] -= 0.3 * deep
+        return position, pointing(yaw, 0.0, INTO_CABINET + 5 * deep)
     if abs(position[2] - TABLE_Z) > 0.025:  # in the drawer, or on another block
         position[2] += 0.008
     return position, pointing(yaw, *stretch(position))
 
 
 def _finger_room(view: View, x: float) -> tuple[float, float]:
-    """x (m) between which an open hand fits into the cabinet: its fingers reach out 0.067 m."""
-    reach = 0.075
+    """x (m) between which an open hand fits into the cabinet.
+
+    Its fingers reach out 0.067 m to either side, which counts beside a wall; the hand, 0.1 m, beside the door.
+    """
     low, high = open_part(view, x)
+    left, right = view.scene.cabinet
+    low += 0.075 if low == left else 0.105
+    high -= 0.075 if high == right else 0.105
     middle = (low + high) / 2
-    return min(low + reach, middle), max(high - reach, middle)
+    return min(low, middle), max(high, middle)
 
 
 def _coax(view: View, color: str) -> Iterator[Waypoint]:
     """Slides a block that stands too near to a wall or to the door's edge inwards, with a fingertip on its top."""
-    for _ in range(3):
+    for _ in range(4):
         x, y = view.block(color)[:2]
         low, high = _finger_room(view, x)
         slack = 0.037 - _half_width(view, color, np.array([1.0, 0.0]))
         aim = float(np.clip(x, low - slack, high + slack))
         if abs(aim - x) < 0.002 or y > 0.16:
             return
-        aim += 0.012 * np.sign(aim - x)
-        euler = pointing(FORWARD, 0.0, INTO_CABINET)
-        top = np.array([np.clip(x, low - 0.04, high + 0.04), y, view.block(color)[2] + BLOCK_SIDE / 2 + 0.016])
+        inwards = np.sign(aim - x)
+        aim += 0.012 * inwards
+        # the hand's end on the side of the door or wall turns out of the cabinet
+        lean = _hold(view, color, FORWARD)[1]
+        euler = pointing(FORWARD + inwards, 0.0, -lean[1])
+        top = np.array([x, y, view.block(color)[2] + BLOCK_SIDE / 2 + 0.016])
         yield from travel(view, top - 0.14 * approach(euler), CLOSED, euler)
         yield view.go(top - 0.05 * approach(euler), CLOSED, euler, tolerance=0.01)
         yield view.go(top - [0, 0, 0.008], CLOSED, euler, slow=0.6, tolerance=0.005)

@@ -86,11 +86,20 @@ def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, go
         return False
     color = _color(task)
     if color is not None:
+        if task.endswith("_slider") and not _beside_door(desk.scene, got, color):
+            return False
         surface = {"slider": PLANK, "drawer": DRAWER}.get(task.rsplit("_", 1)[-1], TABLE)
         return snapshot.blocks[color].contacts == {surface}
     if task == "unstack_block":
         return any(b.bodies and b.bodies <= set(COLORS) and b.resting for b in snapshot.blocks.values())
     return bool(np.allclose(got[[0, 1, 3, 4, 5]], wanted[[0, 1, 3, 4, 5]], atol=5e-3))
+
+
+def _beside_door(scene: Scene, state: np.ndarray, color: str) -> bool:
+    """Whether a block in the cabinet stands clear of the door: its middle 0.03 m beside the door's edge."""
+    door = scene.slide_x - state[0]
+    x = state[6 + 6 * COLORS.index(color)]
+    return bool(x < door - 0.03 or x > door + 0.31)
 
 
 def _color(task: str) -> str | None:
