@@ -141,6 +141,9 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
         position[0] = np.clip(position[0], *_finger_room(view, position[0]))
         deep = np.clip(position[1] - 0.085, 0.0, 0.04)  # there the hand itself would touch the door
         position[1] -= 0.3 * deep
+        # a leaning hand that is turned has one finger lower than the other: turn it half as far as the block is
+        yaw = FORWARD + (yaw - FORWARD) / 2 if abs(yaw - FORWARD) < 0.8 else yaw
+        position[2] += 0.05 * abs(np.sin(yaw - FORWARD)) * np.sin(INTO_CABINET)
         return position, pointing(yaw, 0.0, INTO_CABINET + 5 * deep)
     if abs(position[2] - TABLE_Z) > 0.025:  # in the drawer, or on another block
         position[2] += 0.008
@@ -150,12 +153,12 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
 def _finger_room(view: View, x: float) -> tuple[float, float]:
     """x (m) between which an open hand fits into the cabinet.
 
-    Its fingers reach out 0.067 m to either side, which counts beside a wall; the hand, 0.1 m, beside the door.
+    Its fingers reach out 0.067 m to either side, which counts beside a wall; much of the hand, 0.095 m, beside the door.
     """
     low, high = open_part(view, x)
     left, right = view.scene.cabinet
-    low += 0.075 if low == left else 0.105
-    high -= 0.075 if high == right else 0.105
+    low += 0.075 if low == left else 0.095
+    high -= 0.075 if high == right else 0.095
     middle = (low + high) / 2
     return min(low, middle), max(high, middle)
 
@@ -170,15 +173,16 @@ def _coax(view: View, color: str) -> Iterator[Waypoint]:
         if abs(aim - x) < 0.002 or y > 0.16:
             return
         inwards = np.sign(aim - x)
-        aim += 0.012 * inwards
+        aim += 0.02 * inwards
         # the hand's end on the side of the door or wall turns out of the cabinet
         lean = _hold(view, color, FORWARD)[1]
         euler = pointing(FORWARD + inwards, 0.0, -lean[1])
         top = np.array([x, y, view.block(color)[2] + BLOCK_SIDE / 2 + 0.016])
         yield from travel(view, top - 0.14 * approach(euler), CLOSED, euler)
         yield view.go(top - 0.05 * approach(euler), CLOSED, euler, tolerance=0.01)
-        yield view.go(top - [0, 0, 0.008], CLOSED, euler, slow=0.6, tolerance=0.005)
-        yield view.go(top + [aim - x, 0.0, -0.03], CLOSED, euler, slow=0.4, tolerance=0.006)
+        yield view.go(top - [0, 0, 0.002], CLOSED, euler, slow=0.8, tolerance=0.012)
+        yield view.go(top + [(aim - x) / 4, -0.005, -0.03], CLOSED, euler, slow=0.6, tolerance=0.03)
+        yield view.go(top + [aim - x, -0.01, -0.03], CLOSED, euler, slow=0.6, tolerance=0.015)
         yield view.go(view.tcp - 0.1 * approach(euler), CLOSED, euler, tolerance=0.03)
 
 

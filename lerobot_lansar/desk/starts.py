@@ -14,6 +14,9 @@ TABLE_Z = 0.46
 DRAWER_Z = 0.362
 """Height of a block's centre in the drawer (m)."""
 
+REACH = 0.41
+"""|x| up to which blocks can be pushed and still lie on the table, which ends at 0.44 (m)."""
+
 _CLEARANCE = 0.10  # between block centres (m): no two blocks touch, and a hand fits between most of them
 _TRIES = 200
 _REACHED = 0.02  # a start pose counts when IK brings the TCP this near (m)
@@ -85,6 +88,10 @@ def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, go
     if any(np.linalg.norm(got[blocks][i] - wanted[blocks][i]) > 0.02 for i in positions):
         return False
     color = _color(task)
+    if task.startswith("push_") and color is not None:
+        end = got[6 + 6 * COLORS.index(color)] + (0.11 if task.endswith("right") else -0.11)
+        if abs(end) > REACH:
+            return False
     if color is not None:
         if task.endswith("_slider") and not _beside_door(desk.scene, got, color):
             return False
@@ -96,10 +103,10 @@ def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, go
 
 
 def _beside_door(scene: Scene, state: np.ndarray, color: str) -> bool:
-    """Whether a block in the cabinet stands clear of the door: its middle 0.03 m beside the door's edge."""
+    """Whether a finger fits between a block in the cabinet and the door's edge: 0.045 m from the block's middle."""
     door = scene.slide_x - state[0]
     x = state[6 + 6 * COLORS.index(color)]
-    return bool(x < door - 0.03 or x > door + 0.31)
+    return bool(x < door - 0.045 or x > door + 0.28 + 0.045)
 
 
 def _color(task: str) -> str | None:
