@@ -1,71 +1,130 @@
 """Writes demonstrations the way CALVIN keeps them on disk: one npz per frame, windows and sentences beside them."""
 
+import io
+import json
 import os
 import shutil
+import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from tqdm import tqdm
 
 from ..desk.scenes import COLORS, Scene
 
 FRAME = "episode_{:07d}.npz"
+STATES = ("robot_obs", "scene_obs")
 
 
-@dataclass(frozen=True)
-class Recording:
-    """One demonstration that lies in ``folder`` as frames ``000000.npz`` …, with what was asked for."""
+@dataclass
+class Unit:
+    """Frames that were recorded in one go and lie as ``000000.npz`` … in a folder of their own.
 
-    folder: Path
-    frames: int
-    task: str
-    sentence: str
+    Attributes:
+        scene: The scene's letter.
+        frames: How many there are.
+        recordings: [first, end) of each uninterrupted stretch.
+        windows: (first, end, task): frames [first, end) fulfil the task.
+        tried: Task to how often it was tried.
+        accepted: Task to how often the oracle saw it fulfilled.
+        sums: For ``robot_obs`` and ``scene_obs`` (as on disk) the sums of values and of squares.
+    """
+
+    scene: str
+    frames: int = 0
+    recordings: list[tuple[int, int]] = field(default_factory=list)
+    windows: list[tuple[int, int, str]] = field(default_factory=list)
+    tried: dict[str, int] = field(default_factory=dict)
+    accepted: dict[str, int] = field(default_factory=dict)
+    sums: dict[str, list[list[float]]] = field(default_factory=dict)
+
+    def save(self, file: Path) -> None:
+        """Writes it down; the file appears in one go."""
+        partial = file.with_name(f".{file.name}-{os.getpid()}.partial")
+        partial.write_text(json.dumps(asdict(self)))
+        partial.rename(file)
+
+    @classmethod
+    def load(cls, file: Path) -> "Unit":
+        """Reads what :meth:`save` wrote."""
+        return cls(**json.loads(file.read_text()))
 
 
-def write_frames(folder: Path, frames: dict[str, np.ndarray], scene: Scene) -> None:
-    """Writes one npz per frame into ``folder``, which appears only when it is complete.
+class FrameWriter:
+    """Writes one npz per frame into ``folder``, which appears when the writer is closed without an error.
 
     ``scene_obs`` comes with blocks in red, blue, pink order and goes to disk in the scene's original order, which is
     what CALVIN's own files have.
     """
-    partial = folder.with_name(f"{folder.name}-{os.getpid()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    data = dict(frames)
-    data["scene_obs"] = _original_order(frames["scene_obs"], scene)
-    save = np.savez_compressed if any(key.startswith("rgb_") for key in data) else np.savez
-    for index in range(len(data["actions"])):
-        save(partial / f"{index:06d}.npz", **{key: values[index] for key, values in data.items()})  # type: ignore[arg-type]
-    partial.rename(folder)
+
+    def __init__(self, folder: Path, scene: Scene):
+        self._folder = folder
+        self._partial = folder.with_name(f"{folder.name}-{os.getpid()}.partial")
+        self._columns = _original_order(scene)
+        self._sums: dict[str, np.ndarray] = {}
+        self.frames = 0
+
+    def add(self, frame: dict[str, np.ndarray]) -> None:
+        """Writes the next frame: ``robot_obs`` (15,), ``scene_obs`` (24,), actions (7,) and pictures."""
+        data = {**frame, "scene_obs": frame["scene_obs"][self._columns]}
+        for key in STATES:
+            sums = np.stack([data[key], data[key] ** 2])
+            self._sums[key] = self._sums.get(key, 0.0) + sums
+        # pictures shrink to a third with the quickest compression, and hardly further with any other
+        packed = any(key.startswith(("rgb_", "depth_")) for key in data)
+        kind = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
+        with zipfile.ZipFile(self._partial / f"{self.frames:06d}.npz", "w", kind, compresslevel=1) as file:
+            for key, value in data.items():
+                buffer = io.BytesIO()
+                np.lib.format.write_array(buffer, np.asanyarray(value), allow_pickle=False)
+                file.writestr(f"{key}.npy", buffer.getbuffer())
+        self.frames += 1
+
+    def sums(self) -> dict[str, list[list[float]]]:
+        """See :class:`Unit`."""
+        return {key: value.tolist() for key, value in self._sums.items()}
+
+    def __enter__(self) -> "FrameWriter":
+        shutil.rmtree(self._partial, ignore_errors=True)
+        self._partial.mkdir(parents=True)
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._partial.rename(self._folder)
+        else:
+            shutil.rmtree(self._partial, ignore_errors=True)
 
 
-def _original_order(scene_obs: np.ndarray, scene: Scene) -> np.ndarray:
+def _original_order(scene: Scene) -> list[int]:
     columns = list(range(6))
     for color in scene.blocks:
         first = 6 + 6 * COLORS.index(color)
         columns += range(first, first + 6)
-    return scene_obs[:, columns]
+    return columns
 
 
 def publish_split(
     target: Path,
-    recordings: Sequence[Recording],
-    scene: Scene,
+    units: Sequence[tuple[Path, Unit, Sequence[str]]],
     first_frame: int,
     config: dict[str, Any],
-    commands: dict[str, list[str]],
+    sentences: dict[str, str],
 ) -> int:
-    """Builds one split (``training`` or ``validation``) from recorded episodes; ``target`` appears when complete.
+    """Builds one split (``training`` or ``validation``) from recorded units; ``target`` appears when complete.
 
     Args:
         target: The split's folder; must not exist.
-        recordings: In the order in which they get their frame numbers.
+        units: Folder, unit and the sentences of its windows, in the order in which they get their frame numbers; units
+            of one scene follow each other.
         first_frame: Number of the first frame.
         config: Kept in ``.hydra/merged_config.yaml``.
-        commands: The sentences by task; the validation split lists the first one of each.
+        sentences: The benchmark's sentence of each task, listed by the validation split.
 
     Returns:
         The number after the last frame.
@@ -74,43 +133,59 @@ def publish_split(
     shutil.rmtree(partial, ignore_errors=True)
     (partial / "lang_annotations").mkdir(parents=True)
     (partial / ".hydra").mkdir()
-    bounds, number = [], first_frame
-    states: dict[str, list[np.ndarray]] = {"robot_obs": [], "scene_obs": []}
-    for recording in recordings:
-        for index in range(recording.frames):
-            source = recording.folder / f"{index:06d}.npz"
-            _link(source, partial / FRAME.format(number + index))
-        with np.load(recording.folder / "000000.npz") as frame:
-            for key, values in states.items():
-                values.append(frame[key])
-        bounds.append((number, number + recording.frames))
-        number += recording.frames
-    windows = np.array(bounds, dtype=np.int64).reshape(-1, 2)
+    number = first_frame
+    recordings: list[tuple[int, int]] = []
+    windows: list[tuple[int, int]] = []
+    tasks: list[str] = []
+    said: list[str] = []
+    scenes: dict[str, list[int]] = {}
+    for folder, unit, unit_sentences in tqdm(
+        units, desc=f"writing {target.name}", unit="recording", leave=False
+    ):
+        for index in range(unit.frames):
+            _link(folder / f"{index:06d}.npz", partial / FRAME.format(number + index))
+        recordings += [(number + start, number + end - 1) for start, end in unit.recordings]  # both inclusive
+        windows += [(number + start, number + end) for start, end, _ in unit.windows]  # end exclusive
+        tasks += [task for *_, task in unit.windows]
+        said += unit_sentences
+        scenes.setdefault(f"calvin_scene_{unit.scene}", [number, 0])[1] = number + unit.frames - 1
+        number += unit.frames
     annotations = {
-        "language": {
-            "ann": [r.sentence for r in recordings],
-            "task": [r.task for r in recordings],
-            "emb": np.zeros((len(recordings), 0), dtype=np.float32),
-        },
-        "info": {"episodes": [], "indx": [tuple(int(v) for v in row) for row in windows]},
+        "language": {"ann": said, "task": tasks, "emb": np.zeros((len(said), 0), dtype=np.float32)},
+        "info": {"episodes": [], "indx": windows},
     }
     _save(partial / "lang_annotations" / "auto_lang_ann.npy", annotations)
     if target.name == "validation":
-        sentences = {task: {"ann": [listed[0]]} for task, listed in commands.items()}
-        _save(partial / "lang_annotations" / "embeddings.npy", sentences)
-    np.save(partial / "ep_start_end_ids.npy", windows - [0, 1])  # first and last frame, both inclusive
-    np.save(partial / "ep_lens.npy", windows[:, 1] - windows[:, 0])
-    scenes = {f"calvin_scene_{scene.name}": [first_frame, number - 1]}
+        benchmark = {task: {"ann": [sentence]} for task, sentence in sentences.items()}
+        _save(partial / "lang_annotations" / "embeddings.npy", benchmark)
+    bounds = np.array(recordings, dtype=np.int64).reshape(-1, 2)
+    np.save(partial / "ep_start_end_ids.npy", bounds)
+    np.save(partial / "ep_lens.npy", bounds[:, 1] - bounds[:, 0] + 1)
     _save(partial / "scene_info.npy", scenes)
-    statistics = {
-        key: {"mean": np.mean(values, 0).tolist(), "std": np.std(values, 0).tolist()}
-        for key, values in states.items()
-        if values
-    }
-    (partial / "statistics.yaml").write_text(yaml.safe_dump(statistics))
+    (partial / "statistics.yaml").write_text(yaml.safe_dump(_statistics([unit for _, unit, _ in units])))
     (partial / ".hydra" / "merged_config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
     partial.rename(target)
     return number
+
+
+def _statistics(units: Sequence[Unit]) -> dict[str, dict[str, list[float]]]:
+    count = sum(unit.frames for unit in units)
+    statistics = {}
+    for key in STATES if count else ():
+        total, squares = np.sum([unit.sums[key] for unit in units], axis=0)
+        mean = total / count
+        deviation = np.sqrt(np.maximum(squares / count - mean**2, 0.0))
+        statistics[key] = {"mean": mean.tolist(), "std": deviation.tolist()}
+    return statistics
+
+
+def group_by_scene(scenes: Sequence[str], count: int) -> list[str]:
+    """The scene of each of ``count`` units: as even as possible, units of one scene following each other.
+
+    >>> group_by_scene(["A", "B"], 5)
+    ['A', 'A', 'A', 'B', 'B']
+    """
+    return [scenes[index * len(scenes) // count] for index in range(count)]
 
 
 def _save(file: Path, content: dict[str, Any]) -> None:
@@ -121,5 +196,5 @@ def _save(file: Path, content: dict[str, Any]) -> None:
 def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # a file system without hard links
+    except OSError:
         shutil.copyfile(source, target)

@@ -7,16 +7,20 @@ import numpy as np
 
 from ..desk import TASKS, Desk, DeskError
 from ..desk.desk import Observation
+from ..desk.oracle import Snapshot
 from ..desk.starts import sample_start
 from .motion import Disturbance, Motion, relative_action
-from .moves import Style, View, Waypoint
+from .moves import Skill, Style, View
 from .skills import SKILLS
 
 MAX_STEPS = 360
+"""Control steps that CALVIN's protocol gives a command."""
 AFTERWARDS = 2
 """The oracle must be satisfied in one frame and in so many after it; then a demonstration ends."""
 _PATIENCE = 12  # control steps without progress after which the next waypoint is due
 _TURN_TOLERANCE = 0.12  # rad
+
+Frame = dict[str, np.ndarray]
 
 
 @dataclass
@@ -29,7 +33,7 @@ class Demonstration:
     """
 
     task: str
-    frames: dict[str, np.ndarray] = field(default_factory=dict)
+    frames: Frame = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.frames["actions"])
@@ -38,33 +42,34 @@ class Demonstration:
 def carry_out(
     desk: Desk,
     obs: Observation,
-    task: str,
+    skill: Skill,
     rng: np.random.Generator,
     *,
-    variety: float,
-    noise: float,
-    steps: int,
-    fulfilled: Callable[[], bool],
-) -> Iterator[tuple[dict[str, np.ndarray], Observation]]:
-    """Does ``task`` from the present state; ends once it is and stays ``fulfilled``, or at the skill's end.
+    variety: float = 1.0,
+    noise: float = 0.2,
+    steps: int = MAX_STEPS,
+    fulfilled: Callable[[Snapshot], bool] = lambda _: False,
+) -> Iterator[tuple[Frame, Observation, Snapshot]]:
+    """Carries out a skill from the present state; ends once it is and stays ``fulfilled``, or at the skill's end.
 
     Args:
         desk: In the state that ``obs`` shows.
         obs: The latest observation.
-        task: One of :data:`SKILLS`.
+        skill: Where the hand goes.
         rng: Decides style and noise.
         variety, noise: As for :func:`demonstrate`.
         steps: Control steps at most.
         fulfilled: Asked after every step.
 
     Yields:
-        For each control step its frame (observation, ``actions``, ``rel_actions``) and the observation after it.
+        For each control step its frame (the observation before it, ``actions``, ``rel_actions``), and the observation
+        and the snapshot after it.
     """
     view = View(desk.scene, obs["robot_obs"], obs["scene_obs"], rng, Style.sample(rng, variety))
     motion = Motion(obs["robot_obs"], view.style.speed)
     disturbance = Disturbance(noise, rng)
     stays = 0
-    for waypoint in SKILLS[task](view):
+    for waypoint in skill(view):
         pause = int(rng.integers(1, 9)) if rng.uniform() < view.style.pauses else 0
         best, stalled, held = np.inf, 0, 0
         while waypoint.keep is None or waypoint.keep():
@@ -72,18 +77,19 @@ def carry_out(
             arrived = distance < waypoint.tolerance and turn < _TURN_TOLERANCE
             if arrived and held >= waypoint.hold + pause:
                 break
-            held += int(arrived)
             if steps <= 0:
                 return
             action = motion.toward(waypoint, obs["robot_obs"])
             frame = {**obs, "actions": action, "rel_actions": relative_action(action, obs["robot_obs"])}
             obs = desk.step(disturbance.of(action), control_mode="abs")
             view.robot_obs, view.scene_obs = obs["robot_obs"], obs["scene_obs"]
+            snapshot = desk.snapshot()
+            yield frame, obs, snapshot
             steps -= 1
-            yield frame, obs
-            stays = stays + 1 if fulfilled() else 0
+            stays = stays + 1 if fulfilled(snapshot) else 0
             if stays > AFTERWARDS:
                 return
+            held += int(arrived)
             error = distance + 0.1 * turn
             stalled = 0 if error < best - 1e-3 else stalled + 1
             best = min(best, error)
@@ -114,17 +120,18 @@ def demonstrate(
     if task not in SKILLS:
         raise DeskError(f"task {task!r} is unknown; choose among: {', '.join(SKILLS)}")
     obs = desk.reset(*sample_start(desk, task, rng))
-    start, oracle = desk.snapshot(), TASKS[task]
-
-    def fulfilled() -> bool:
-        return oracle(start, desk.snapshot())
-
-    rows = [
-        frame
-        for frame, _ in carry_out(
-            desk, obs, task, rng, variety=variety, noise=noise, steps=MAX_STEPS, fulfilled=fulfilled
-        )
-    ]
-    if not rows or not fulfilled():
+    start, rows, done = desk.snapshot(), [], False
+    for frame, _, snapshot in carry_out(
+        desk,
+        obs,
+        SKILLS[task],
+        rng,
+        variety=variety,
+        noise=noise,
+        fulfilled=lambda now: TASKS[task](start, now),
+    ):
+        rows.append(frame)
+        done = TASKS[task](start, snapshot)
+    if not done:
         return None
     return Demonstration(task, {key: np.stack([row[key] for row in rows]) for key in rows[0]})

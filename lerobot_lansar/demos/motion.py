@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..desk.robot import ANGLE_STEP, POSITION_STEP
-from .moves import FORWARD, Waypoint, turned
+from .moves import Waypoint, turned
 
 RESPONSE = 0.5
 """Share of the commanded way that the arm goes in one control step, in translation and rotation (measured)."""
@@ -71,7 +71,9 @@ class Motion:
         left = _difference(target, self._plan)
         top = self._speed * waypoint.slow
         self._velocity[:3] = _accelerate(self._velocity[:3], left[:3], TOP_SPEED * top, ACCELERATION)
-        self._velocity[3:] = _accelerate(self._velocity[3:], left[3:], TOP_TURN * (1 + self._speed) / 2, TURN_ACCELERATION)
+        self._velocity[3:] = _accelerate(
+            self._velocity[3:], left[3:], TOP_TURN * (1 + self._speed) / 2, TURN_ACCELERATION
+        )
         self._plan = self._plan + self._velocity
         step = np.array([POSITION_STEP] * 3 + [ANGLE_STEP] * 3)
         command = np.clip(self._velocity / RESPONSE + ahead, -step, step)

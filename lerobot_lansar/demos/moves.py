@@ -187,7 +187,9 @@ def retreat(view: View, gripper: float, keep: Callable[[], bool] | None = None) 
     if in_cabinet(view.tcp):
         back = view.tcp - 0.12 * approach(view.robot_obs[3:6])
         yield view.go(back, gripper, view.robot_obs[3:6].copy(), **options)
-        yield view.go((view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.robot_obs[3:6].copy(), **options)
+        yield view.go(
+            (view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.robot_obs[3:6].copy(), **options
+        )
     elif view.tcp[2] < view.style.cruise - 0.03:
         above = (view.tcp[0], min(view.tcp[1], -0.05), view.style.cruise)
         yield view.go(above, gripper, view.robot_obs[3:6].copy(), **options)
@@ -231,7 +233,9 @@ def grasp_yaws(view: View, color: str) -> list[float]:
     def badness(candidate: float) -> float:
         # the hand is 0.2 m wide across its fingers: near the cabinet it must stand along it
         sideways = abs(np.sin(candidate - FORWARD)) * (3.0 if pose[1] > -0.10 else 0.5)
-        long_side = 0.5 * (horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE)
+        long_side = 0.5 * (
+            horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE
+        )
         return abs(candidate - now) + sideways + long_side
 
     return sorted((y for y in yaws if YAWS[0] <= y <= YAWS[1]), key=badness)

@@ -19,8 +19,8 @@ from ..desk import CONTROL_HZ, TASKS, Desk, DeskError, Observation, SimulationEr
 from ..desk.commands import load_commands
 from ..desk.robot import ANGLE_STEP, POSITION_STEP
 from ..desk.starts import sample_start
-from .calvin_folder import Recording, publish_split, write_frames
-from .demonstrator import relative_action
+from .calvin_folder import FrameWriter, Unit, publish_split
+from .motion import relative_action
 
 MOVES = {
     "d": (0, 1.0), "a": (0, -1.0), "w": (1, 1.0), "s": (1, -1.0), "r": (2, 1.0), "f": (2, -1.0),
@@ -83,9 +83,9 @@ class Session:
 
     def __init__(self, config: PlayConfig, desk: Desk):
         self.config, self.desk = config, desk
-        self.kept: list[Recording] = []
+        self.kept: list[tuple[Path, Unit, list[str]]] = []
         self.recording = False
-        self._commands = load_commands(None)
+        self._commands = load_commands(None, "training")
         self._starts = config.seed
         self.begin()
 
@@ -146,9 +146,12 @@ class Session:
         )
         assert task is not None
         folder = output / ".playing" / f"{len(self.kept):06d}"
-        frames = {key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]}
-        write_frames(folder, frames, self.desk.scene)
-        self.kept.append(Recording(folder, len(self._rows), task, self._commands[task][0]))
+        with FrameWriter(folder, self.desk.scene) as writer:
+            for row in self._rows:
+                writer.add(row)
+        n = len(self._rows)
+        unit = Unit(self.desk.scene.name, n, [(0, n)], [(0, n, task)], sums=writer.sums())
+        self.kept.append((folder, unit, [self._commands[task][0]]))
 
     def finish(self) -> None:
         """Publishes the demonstrations kept as OUTPUT_DIR/training; to be called however the session ended."""
@@ -159,7 +162,7 @@ class Session:
             details = {key: str(value) for key, value in asdict(self.config).items()} | {
                 "control_hz": CONTROL_HZ
             }
-            publish_split(output / "training", self.kept, self.desk.scene, 0, details, self._commands)
+            publish_split(output / "training", self.kept, 0, details, {})
             print(f"{len(self.kept)} demonstrations in {output}")
         shutil.rmtree(output / ".playing", ignore_errors=True)
 

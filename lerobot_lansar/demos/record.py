@@ -1,129 +1,288 @@
 """``lansar-record``: scripted demonstrations on the desk, in CALVIN's own on-disk format."""
 
+import contextlib
 import fcntl
 import json
-import multiprocessing
 import os
 import shutil
 import sys
-import threading
-import time
+from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import draccus
 import numpy as np
-from tqdm import tqdm
 
 from ..desk import CONTROL_HZ, Desk, DeskError, SimulationError
 from ..desk.commands import load_commands
-from ..desk.scenes import Scene
-from .calvin_folder import Recording, publish_split, write_frames
-from .demonstrator import demonstrate
+from ..executors import EXECUTORS, SlurmConfig, WorkerDied, run_shards
+from .calvin_folder import FrameWriter, Unit, group_by_scene, publish_split
+from .demonstrator import Demonstration, demonstrate
+from .play_data import record_play
 from .skills import SKILLS
 
 ATTEMPTS = 20
+SPLITS = ("training", "validation")
+STAGING = ".recording"
 
 
 @dataclass
 class RecordConfig:
-    """Records demonstrations of one scene into OUTPUT_DIR/training and OUTPUT_DIR/validation."""
+    """Records demonstrations into OUTPUT_DIR/training and OUTPUT_DIR/validation, as CALVIN keeps its own."""
 
     output_dir: Path
-    scene: str = "D"
-    # Tasks to demonstrate, in turn (naming one twice doubles its share); all that can be demonstrated by default.
+    # One scene, or a list of them that share the recording evenly: --scene='[A,B,C]'.
+    scene: str | list[str] = "D"
+    # windows: one episode for each command; play: tasks follow each other without a reset, windows are cut from it.
+    mode: str = "windows"
+    # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
     tasks: list[str] = field(default_factory=lambda: list(SKILLS))
-    # Accepted demonstrations in the training split, and in the validation split (a tenth by default).
+    # Accepted demonstrations in the training split, and in the validation split (a tenth by default). Windows only.
     episodes: int = 100
     validation_episodes: int | None = None
+    # Hours of play in the training split, and in the validation split (a tenth by default). Play only.
+    hours: float = 1.0
+    validation_hours: float | None = None
+    # Play is recorded in sessions of so many minutes; sessions are what workers share.
+    session_minutes: float = 2.0
     seed: int = 0
     # Pictures to record: static, gripper; '[]' records states only, many times faster.
     cameras: list[str] = field(default_factory=lambda: ["static", "gripper"])
     # Disturbance of executed actions, in relative action units (recorded are the intended ones).
     noise: float = 0.2
+    # How much speed, approach, contact points and pauses differ between episodes: 0 (not at all) to 1.
+    variety: float = 1.0
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
     # Who draws the pictures: fast, fast_gl (the look of CALVIN's public data), tiny or egl.
     renderer: str = "fast"
-    # YAML of sentences by task; our own by default.
+    # YAML of sentences by task for each split; our own by default.
     annotations: str | None = None
+    validation_annotations: str | None = None
+    # Who does the work: local processes, slurm or ray (pip install 'lerobot_policy_lansar[ray]').
+    executor: str = "local"
     workers: int = 1
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
 
     def __post_init__(self) -> None:
         if self.validation_episodes is None:
             self.validation_episodes = max(1, round(self.episodes / 10))
+        if self.validation_hours is None:
+            self.validation_hours = self.hours / 10
 
     def check(self) -> None:
         """Raises DeskError for options that cannot be carried out."""
         for task in self.tasks:
             if task not in SKILLS:
-                raise DeskError(
-                    f"--tasks: {task!r} cannot be demonstrated; choose among: {', '.join(SKILLS)}"
-                )
+                raise DeskError(f"--tasks: there is no task {task!r}; choose among: {', '.join(SKILLS)}")
         if not self.tasks:
             raise DeskError("--tasks must name at least one task")
+        if not self.scenes or len(set(self.scenes)) != len(self.scenes):
+            raise DeskError(f"--scene must name one scene, or different ones as '[A,B]', got {self.scene}")
+        if self.mode not in ("windows", "play"):
+            raise DeskError(f"--mode is windows or play, got {self.mode!r}")
+        if self.executor not in EXECUTORS:
+            raise DeskError(f"--executor is one of {', '.join(EXECUTORS)}, got {self.executor!r}")
+        if self.executor == "slurm" and shutil.which("sbatch") is None:
+            raise DeskError("--executor=slurm needs Slurm's sbatch on the PATH")
+        if not 0 <= self.variety <= 1:
+            raise DeskError(f"--variety lies between 0 and 1, got {self.variety}")
+        if not 0 <= self.noise <= 1:
+            raise DeskError(f"--noise lies between 0 and 1, got {self.noise}")
         for name in ("episodes", "validation_episodes", "workers"):
             if getattr(self, name) < 1:
                 raise DeskError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("hours", "validation_hours", "session_minutes"):
+            if not getattr(self, name) > 0:
+                raise DeskError(f"--{name} must be more than 0, got {getattr(self, name)}")
+
+    @property
+    def scenes(self) -> list[str]:
+        """The scenes by letter."""
+        return [self.scene] if isinstance(self.scene, str) else self.scene
 
     def request(self) -> dict[str, object]:
-        """What decides the recorded data: everything but where it goes and how many processes make it."""
-        return {k: v for k, v in asdict(self).items() if k not in ("output_dir", "workers")}
+        """What decides the recorded data: everything but where it goes and who makes it."""
+        without = {"output_dir", "workers", "executor", "slurm"}
+        without |= (
+            {"tasks", "episodes", "validation_episodes"}
+            if self.mode == "play"
+            else {"hours", "validation_hours", "session_minutes"}
+        )
+        return {k: v for k, v in asdict(self).items() if k not in without}
+
+    def counts(self) -> tuple[int, int]:
+        """How many units the training and the validation split have: episodes, or sessions of play."""
+        if self.mode == "windows":
+            assert self.validation_episodes is not None
+            return self.episodes, self.validation_episodes
+        assert self.validation_hours is not None
+        training, validation = (
+            max(1, round(hours * 60 / self.session_minutes)) for hours in (self.hours, self.validation_hours)
+        )
+        return training, validation
+
+    def shard_size(self) -> int:
+        """Units that one shard of work records; it depends on the request alone."""
+        return 1 if self.mode == "play" else max(8, sum(self.counts()) // 500)
 
 
 def record(config: RecordConfig) -> Path:
     """Records what ``config`` asks for; an interrupted recording goes on where it stopped.
 
-    Episode k depends on (seed, k) alone, so the data are the same for any number of workers. Finished episodes wait
-    in OUTPUT_DIR/.recording; the splits appear at the end, each in one rename.
+    Unit k (an episode, or a session of play) depends on (seed, k) alone, so the data are the same for any number of
+    workers. Finished units wait in OUTPUT_DIR/.recording; the splits appear at the end, each in one rename.
 
     Raises:
         DeskError: The folder holds a finished recording, or one that was begun with other options.
+        WorkerDied: A worker was killed.
     """
     config.check()
-    scene, kind = _look(config)
-    output, staging = config.output_dir, config.output_dir / ".recording"
-    commands = load_commands(config.annotations)
-    if (output / "training").exists() and (output / "validation").exists():
+    kinds = {_look(config, scene) for scene in config.scenes}
+    for split in SPLITS:
+        load_commands(_annotations(config, split), split)
+    output, staging = config.output_dir, config.output_dir / STAGING
+    if all((output / split).exists() for split in SPLITS):
         shutil.rmtree(staging, ignore_errors=True)  # a run may have ended while it tidied up
         raise DeskError(f"{output} already holds a recording; give another --output_dir or delete it first")
     staging.mkdir(parents=True, exist_ok=True)
-    with _locked(staging):
+    with _locked(staging) if config.executor == "local" else contextlib.nullcontext():
         _claim(staging, config)
-        recordings = _record_all(config, commands)
-        _publish(config, recordings, scene, kind, commands)
-        shutil.rmtree(staging)
-    _summarise(config, recordings)
+        total = sum(config.counts())
+        done = run_shards(
+            (record_shard, (config,)),
+            -(-total // config.shard_size()),
+            (publish, (config, kinds.pop())),
+            executor=config.executor,
+            workers=config.workers,
+            slurm=config.slurm,
+            logging_dir=staging / "jobs",
+            progress=lambda: len(list(staging.glob("[0-9]*.json"))),
+            total=total,
+            unit="episode" if config.mode == "windows" else "session",
+        )
+    if not done:
+        print(f"submitted; {output / SPLITS[0]} and {output / SPLITS[1]} appear when the jobs are done")
     return output
 
 
-def _record_all(config: RecordConfig, commands: dict[str, list[str]]) -> list[Recording]:
-    """Records the episodes that are not there yet; returns all of them in order."""
-    staging = config.output_dir / ".recording"
-    assert config.validation_episodes is not None
-    total = config.episodes + config.validation_episodes
-    missing = [k for k in range(total) if not (staging / f"{k:06d}.json").exists()]
-    _run(config, missing, total)
-    return [_recording(staging, k, commands, config) for k in range(total)]
+def record_shard(config: RecordConfig, shard: int) -> None:
+    """Records those units of one shard that are not there yet."""
+    size, total = config.shard_size(), sum(config.counts())
+    for index in range(shard * size, min((shard + 1) * size, total)):
+        if not _note(config, index).exists():
+            record_unit(config, index)
 
 
-def _publish(
-    config: RecordConfig, recordings: list[Recording], scene: Scene, kind: str, commands: dict[str, list[str]]
-) -> None:
+def record_unit(config: RecordConfig, index: int) -> None:
+    """Records one episode (the first accepted one of its attempts) or one session of play."""
+    scene = unit_scene(config, index)
+    desk = _desk(scene, config.assets, tuple(config.cameras), config.renderer)
+    with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene) as writer:
+        if config.mode == "play":
+            frames = round(config.session_minutes * 60 * CONTROL_HZ)
+            rng = np.random.default_rng([config.seed, index])
+            unit = record_play(desk, frames, rng, writer, config.noise, config.variety)
+        else:
+            demonstration, tried = _attempt(config, desk, index)
+            for t in range(len(demonstration)):
+                writer.add({key: values[t] for key, values in demonstration.frames.items()})
+            task, n = demonstration.task, len(demonstration)
+            unit = Unit(scene, n, [(0, n)], [(0, n, task)], {task: tried}, {task: 1}, writer.sums())
+    unit.save(_note(config, index))
+
+
+def _attempt(config: RecordConfig, desk: Desk, index: int) -> tuple[Demonstration, int]:
+    task = config.tasks[index % len(config.tasks)]
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([config.seed, index, attempt])
+        try:
+            demonstration = demonstrate(desk, task, rng, config.noise, config.variety)
+        except SimulationError:
+            continue
+        if demonstration is not None:
+            return demonstration, attempt + 1
+    raise DeskError(f"{task} failed {ATTEMPTS} times in a row (seed {config.seed}, episode {index})")
+
+
+def unit_scene(config: RecordConfig, index: int) -> str:
+    """In which scene a unit is recorded: in each split the units of a scene follow each other."""
+    training, validation = config.counts()
+    if index < training:
+        return group_by_scene(config.scenes, training)[index]
+    return group_by_scene(config.scenes, validation)[index - training]
+
+
+@lru_cache(maxsize=4)
+def _desk(scene: str, assets: str | None, cameras: tuple[str, ...], renderer: str) -> Desk:
+    """This process's desks: loading one takes as long as some episodes."""
+    return Desk(scene, assets, cameras, renderer)
+
+
+def _note(config: RecordConfig, index: int) -> Path:
+    return config.output_dir / STAGING / f"{index:06d}.json"
+
+
+def publish(config: RecordConfig, kind: str, _: int = 0) -> None:
+    """Builds both splits from the recorded units, prints the summary and removes the staging folder."""
+    output, staging = config.output_dir, config.output_dir / STAGING
     details = {**config.request(), "assets_used": kind, "control_hz": CONTROL_HZ}
+    benchmark = {
+        task: listed[0] for task, listed in load_commands(config.validation_annotations, "validation").items()
+    }
+    training, validation = config.counts()
+    units = [Unit.load(_note(config, index)) for index in range(training + validation)]
     frame = 0
-    for split, part in (
-        ("training", recordings[: config.episodes]),
-        ("validation", recordings[config.episodes :]),
+    for split, indices in (
+        ("training", range(training)),
+        ("validation", range(training, training + validation)),
     ):
-        shutil.rmtree(config.output_dir / split, ignore_errors=True)  # of a try that ended between the two
-        frame = publish_split(config.output_dir / split, part, scene, frame, details, commands)
+        commands = load_commands(_annotations(config, split), split)
+        rows = [
+            (staging / f"{index:06d}", units[index], _say(commands, units[index], config.seed, index))
+            for index in indices
+        ]
+        shutil.rmtree(output / split, ignore_errors=True)  # of a try that ended between the two
+        frame = publish_split(output / split, rows, frame, details, benchmark)
+    shutil.rmtree(staging)
+    print(summary(config, units))
 
 
-@contextmanager
+def _say(commands: dict[str, list[str]], unit: Unit, seed: int, index: int) -> list[str]:
+    """A random sentence for each of a unit's windows."""
+    rng = np.random.default_rng([seed, index, ATTEMPTS])
+    return [commands[task][int(rng.integers(len(commands[task])))] for *_, task in unit.windows]
+
+
+def _annotations(config: RecordConfig, split: str) -> str | None:
+    return config.annotations if split == "training" else config.validation_annotations
+
+
+def summary(config: RecordConfig, units: list[Unit]) -> str:
+    """Per task: how often it was tried and accepted, its windows and their mean length in frames."""
+    tried, accepted = Counter[str](), Counter[str]()
+    lengths: dict[str, list[int]] = {}
+    for unit in units:
+        tried.update(unit.tried)
+        accepted.update(unit.accepted)
+        for first, end, task in unit.windows:
+            lengths.setdefault(task, []).append(end - first)
+    lines = [f"{'task':28s}   tried  accepted  windows  mean length"]
+    for task in (task for task in SKILLS if tried[task]):
+        windows = lengths.get(task, [])
+        mean = f"{np.mean(windows):11.1f}" if windows else "          -"
+        lines.append(f"{task:28s} {tried[task]:7d}  {accepted[task]:8d}  {len(windows):7d}  {mean}")
+    frames = sum(unit.frames for unit in units)
+    lines.append(
+        f"{frames} frames ({frames / CONTROL_HZ / 3600:.2f} hours), {sum(map(len, lengths.values()))} windows in "
+        f"{config.output_dir}"
+    )
+    return "\n".join(lines)
+
+
+@contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keeps a second process out of ``folder``; the lock ends with its process, however it ends."""
     lock = os.open(folder, os.O_RDONLY)
@@ -136,10 +295,10 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(lock)
 
 
-def _look(config: RecordConfig) -> tuple[Scene, str]:
-    """The scene and the kind of assets; fails early when scene, assets or cameras are not to be had."""
-    with Desk(config.scene, config.assets, config.cameras, config.renderer) as desk:
-        return desk.scene, desk.assets
+def _look(config: RecordConfig, scene: str) -> str:
+    """The kind of assets; fails early when scene, assets or cameras are not to be had."""
+    with Desk(scene, config.assets, config.cameras, config.renderer) as desk:
+        return desk.assets
 
 
 def _claim(staging: Path, config: RecordConfig) -> None:
@@ -160,94 +319,16 @@ def _claim(staging: Path, config: RecordConfig) -> None:
     partial.rename(file)
 
 
-def _run(config: RecordConfig, missing: list[int], total: int) -> None:
-    progress = {"total": total, "initial": total - len(missing), "desc": "recording", "unit": "episode"}
-    with tqdm(**progress) as bar:  # type: ignore[call-overload]
-        for _ in _done(config, missing):
-            bar.update()
-
-
-def _done(config: RecordConfig, missing: list[int]) -> Iterator[None]:
-    if config.workers == 1:
-        _open_desk(config)
-        yield from map(_record_one, missing)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.workers, context, _start_worker, (config, os.getpid())) as pool:
-        futures = [pool.submit(_record_one, index) for index in missing]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)  # nobody writes after the lock is gone
-            raise
-
-
-_worker: tuple[RecordConfig, Desk]
-
-
-def _start_worker(config: RecordConfig, parent: int) -> None:
-    def follow_parent() -> None:  # a killed parent must not leave writers behind
-        while os.getppid() == parent:
-            time.sleep(0.2)
-        os._exit(1)
-
-    threading.Thread(target=follow_parent, daemon=True).start()
-    _open_desk(config)
-
-
-def _open_desk(config: RecordConfig) -> None:
-    global _worker
-    _worker = (config, Desk(config.scene, config.assets, config.cameras, config.renderer))
-
-
-def _record_one(index: int) -> None:
-    """Records episode ``index``: the first accepted one of its attempts."""
-    config, desk = _worker
-    task = config.tasks[index % len(config.tasks)]
-    staging = config.output_dir / ".recording"
-    for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([config.seed, index, attempt])
-        try:
-            demonstration = demonstrate(desk, task, rng, config.noise)
-        except SimulationError:
-            continue
-        if demonstration is not None:
-            break
-    else:
-        raise DeskError(f"{task} failed {ATTEMPTS} times in a row (seed {config.seed}, episode {index})")
-    folder = staging / f"{index:06d}"
-    shutil.rmtree(folder, ignore_errors=True)
-    write_frames(folder, demonstration.frames, desk.scene)
-    note = {"task": task, "frames": len(demonstration), "attempts": attempt + 1}
-    partial = staging / f".{index:06d}-{os.getpid()}.partial"
-    partial.write_text(json.dumps(note))
-    partial.rename(staging / f"{index:06d}.json")
-
-
-def _recording(staging: Path, index: int, commands: dict[str, list[str]], config: RecordConfig) -> Recording:
-    note = json.loads((staging / f"{index:06d}.json").read_text())
-    sentences = commands[note["task"]]
-    choice = np.random.default_rng([config.seed, index, ATTEMPTS]).integers(len(sentences))
-    return Recording(staging / f"{index:06d}", note["frames"], note["task"], sentences[choice])
-
-
-def _summarise(config: RecordConfig, recordings: list[Recording]) -> None:
-    print(f"{'task':28s} episodes  mean length")
-    for task in dict.fromkeys(config.tasks):
-        lengths = [r.frames for r in recordings if r.task == task]
-        if lengths:
-            print(f"{task:28s} {len(lengths):8d}  {np.mean(lengths):11.1f}")
-    print(f"{sum(r.frames for r in recordings)} frames in {config.output_dir}")
-
-
 def main() -> None:
     """Entry point of ``lansar-record``."""
     try:
         record(draccus.parse(RecordConfig))
-    except (DeskError, OSError, draccus.utils.ParsingError) as error:
+    except (DeskError, WorkerDied, OSError, draccus.utils.ParsingError) as error:
         print(f"lansar-record: error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("lansar-record: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Distances come from the desk's measured geometry: handle and lever sizes, button
 """
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -153,7 +154,7 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
 def _finger_room(view: View, x: float) -> tuple[float, float]:
     """x (m) between which an open hand fits into the cabinet.
 
-    Its fingers reach out 0.067 m to either side, which counts beside a wall; much of the hand, 0.095 m, beside the door.
+    Its fingers reach out 0.067 m to either side, which counts beside a wall; the hand, 0.095 m, beside the door.
     """
     low, high = open_part(view, x)
     left, right = view.scene.cabinet
@@ -234,7 +235,11 @@ def unstack_block(view: View) -> Iterator[Waypoint]:
         if not view.holds(top):
             yield from _take(view, top)
         yield view.go(
-            view.tcp + [0, 0, 0.12], CLOSED, view.robot_obs[3:6].copy(), slow=0.8, keep=lambda: view.holds(top)
+            view.tcp + [0, 0, 0.12],
+            CLOSED,
+            view.robot_obs[3:6].copy(),
+            slow=0.8,
+            keep=partial(view.holds, top),
         )
 
 
@@ -250,7 +255,9 @@ def _top_of_stack(view: View) -> str | None:
 # ---- blocks: bringing
 
 
-def _bring(view: View, color: str, position: np.ndarray, euler: np.ndarray, over: float) -> Iterator[Waypoint]:
+def _bring(
+    view: View, color: str, position: np.ndarray, euler: np.ndarray, over: float
+) -> Iterator[Waypoint]:
     """Carries the block in the hand over a place at height ``over``, sets it down there and lets go."""
 
     def keep() -> bool:
@@ -266,7 +273,9 @@ def _bring(view: View, color: str, position: np.ndarray, euler: np.ndarray, over
 
 def _last_held(view: View) -> str:
     """The block in the hand, or the nearest to it if it has slipped already."""
-    return view.held() or min(COLORS, key=lambda color: float(np.linalg.norm(view.block(color)[:3] - view.tcp)))
+    return view.held() or min(
+        COLORS, key=lambda color: float(np.linalg.norm(view.block(color)[:3] - view.tcp))
+    )
 
 
 def _fetch(view: View, color: str) -> Iterator[Waypoint]:
@@ -313,7 +322,9 @@ def place_in_slider(view: View) -> Iterator[Waypoint]:
 
         yield from travel(view, (x, -0.10, 0.60), CLOSED, euler, keep)
         yield view.go((x, -0.10, 0.60 + abs(view.scatter(0.02))), CLOSED, euler, tolerance=0.015, keep=keep)
-        yield view.go((x, 0.082 + view.scatter(0.01), 0.525), CLOSED, euler, slow=0.9, tolerance=0.01, keep=keep)
+        yield view.go(
+            (x, 0.082 + view.scatter(0.01), 0.525), CLOSED, euler, slow=0.9, tolerance=0.01, keep=keep
+        )
         yield view.go((x, 0.088, 0.480), CLOSED, euler, slow=0.7, tolerance=0.008, keep=keep)
         if keep():
             yield view.go(view.tcp.copy(), OPEN, euler, tolerance=0.02, hold=4)
@@ -338,7 +349,9 @@ def open_part(view: View, x: float | None = None) -> tuple[float, float]:
 
 def _freest(view: View, color: str, places: list[np.ndarray]) -> np.ndarray:
     """The first place with room for a block and a hand, or the one farthest from the other blocks."""
-    rooms = [min(float(np.linalg.norm(other[:2] - place[:2])) for other in view.others(color)) for place in places]
+    rooms = [
+        min(float(np.linalg.norm(other[:2] - place[:2])) for other in view.others(color)) for place in places
+    ]
     for place, room in zip(places, rooms, strict=True):
         if room > 0.11:
             return place
@@ -484,7 +497,9 @@ def _push(color: str, direction: float) -> Skill:
                 yield from _shove(view, color, np.array([direction, 0.0]), max(missing, 0.03))
             else:
                 yield from retreat(view, OPEN)
-                yield from _carry(view, color, _landing(view, color, begin, direction))
+                yield from _carry(
+                    view, color, _landing(view, color, begin + direction * np.arange(0.125, 0.34, 0.015))
+                )
 
     return skill
 
@@ -495,7 +510,11 @@ def _way_is_free(view: View, color: str, pose: np.ndarray, end: float) -> bool:
     width = _half_width(view, color, np.array([1.0, 0.0]))
     direction = np.sign(end - pose[0])
     low, high = sorted((pose[0] - direction * (width + 0.06), end + direction * width))
-    if abs(pose[1] + 0.12) < half + 0.045 and low < view.scene.button_x + 0.042 and high > view.scene.button_x - 0.042:
+    if (
+        abs(pose[1] + 0.12) < half + 0.045
+        and low < view.scene.button_x + 0.042
+        and high > view.scene.button_x - 0.042
+    ):
         return False
     for name in COLORS:
         other = view.block(name)
@@ -507,21 +526,17 @@ def _way_is_free(view: View, color: str, pose: np.ndarray, end: float) -> bool:
     return bool(abs(end) < EDGE)
 
 
-def _landing(view: View, color: str, begin: float, direction: float) -> np.ndarray:
-    """A free place (2,) on the table more than 0.1 m from x = ``begin`` in the direction, as near as possible."""
-    y0 = view.block(color)[1]
-    radius = view.length(color) / 2
-    best, least = np.array([begin + direction * 0.13, y0]), np.inf
-    for step in np.arange(0.125, 0.34, 0.015):
+def _landing(view: View, color: str, xs: np.ndarray) -> np.ndarray:
+    """A free place (2,) on the table with x among ``xs``, as near to the block as can be."""
+    pose, radius = view.block(color), view.length(color) / 2
+    best, least = np.array([xs[0], pose[1]]), np.inf
+    for x in xs[np.abs(xs) <= EDGE]:
         for y in np.linspace(-0.14, -0.04, 6):
-            x = begin + direction * step
-            place = np.array([x, y])
-            if abs(x) > EDGE:
-                continue
             if abs(x - view.scene.button_x) < radius + 0.05 and abs(y + 0.12) < radius + 0.05:
                 continue
-            rooms = [np.linalg.norm(other[:2] - place) for other in view.others(color)]
-            cost = step + abs(y - y0) + 5 * max(0.0, 0.1 - float(min(rooms)))
+            place = np.array([x, y])
+            room = min(float(np.linalg.norm(other[:2] - place)) for other in view.others(color))
+            cost = abs(x - pose[0]) + abs(y - pose[1]) + 5 * max(0.0, 0.1 - room)
             if cost < least:
                 best, least = place, cost
     return best
@@ -558,6 +573,14 @@ def _nearest_to_drawer(view: View) -> str | None:
     return min(lying_there, key=effort, default=None)
 
 
+def put_down(view: View) -> Iterator[Waypoint]:
+    """Set the block in the hand down on the table; no task of its own."""
+    color = view.held()
+    if color is not None:
+        place = np.array([*_landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
+        yield from _bring(view, color, place, pointing(turned(view.robot_obs[5]), *stretch(place)), 0.55)
+
+
 SKILLS: dict[str, Skill] = {
     **{f"rotate_{color}_block_right": _rotate(color, -1.0) for color in COLORS},
     **{f"rotate_{color}_block_left": _rotate(color, 1.0) for color in COLORS},
@@ -568,7 +591,9 @@ SKILLS: dict[str, Skill] = {
     "open_drawer": open_drawer,
     "close_drawer": close_drawer,
     **{
-        f"lift_{color}_block_{place}": _lift(color) for color in COLORS for place in ("table", "slider", "drawer")
+        f"lift_{color}_block_{place}": _lift(color)
+        for color in COLORS
+        for place in ("table", "slider", "drawer")
     },
     "place_in_slider": place_in_slider,
     "place_in_drawer": place_in_drawer,

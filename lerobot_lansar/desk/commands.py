@@ -1,5 +1,12 @@
-"""What people say: sentences for each of the 34 tasks, ours or from a file in CALVIN's own format."""
+"""What people say: a small grammar of commands for each of the 34 tasks, or sentences from a user's file.
 
+A task's sentences come in two sets that share none: *training* ones, with which demonstrations are labelled, and
+*validation* ones, held out for evaluation, as CALVIN does it. They start from the example commands in Table 4.1 of the
+thesis. Colour, direction and place are filled in from the task's name, so they cannot be wrong.
+"""
+
+import itertools
+import re
 from pathlib import Path
 
 import yaml
@@ -8,154 +15,241 @@ from .errors import DeskError
 from .oracle import TASKS
 from .scenes import COLORS
 
-_TEMPLATES: dict[str, tuple[str, ...]] = {
+_BLOCK = "the {color} (block|cube)"
+
+_GRAMMAR: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "rotate_{color}_block_{side}": (
-        "take the {color} block and rotate it {side}",
-        "rotate the {color} block to the {side}",
-        "grasp the {color} block and turn it {side}",
-        "give the {color} block a turn towards the {side}",
-        "pick up the {color} block and twist it to the {side}",
+        (
+            f"(take|grasp|grab|pick up) {_BLOCK} and (rotate|turn) it (|to the ){{side}}",
+            f"(rotate|turn) {_BLOCK} (to|towards) the {{side}}",
+            f"give {_BLOCK} a turn to the {{side}}",
+        ),
+        (
+            "twist the {color} block to the {side}",
+            "hold the {color} block and spin it {side}",
+            "make a {side} turn with the {color} block",
+        ),
     ),
     "push_{color}_block_{side}": (
-        "push the {color} block to the {side}",
-        "slide the {color} block towards the {side}",
-        "move the {color} block over to the {side}",
-        "shove the {color} block {side}",
-        "sweep the {color} block to the {side}",
+        (
+            f"(|go )(push|slide|move) {_BLOCK} (to|towards) the {{side}}",
+            f"(push|slide|move) {_BLOCK} over to the {{side}} side",
+        ),
+        (
+            "shove the {color} block to the {side}",
+            "sweep the {color} block over to the {side}",
+            "nudge the {color} block {side}",
+        ),
     ),
     "move_slider_{side}": (
-        "slide the door to the {side}",
-        "move the sliding door to the {side}",
-        "push the door of the cabinet to the {side}",
-        "grasp the door handle and slide the door {side}",
-        "shift the sliding door over to the {side} side",
+        (
+            "(slide|push|move) the (|sliding )door (to|towards) the {side}",
+            "(slide|move) the door handle to the {side}",
+            "grasp the door handle and (slide|move) the door {side}",
+        ),
+        (
+            "pull the sliding door over to the {side} side",
+            "shift the cabinet's door to the {side}",
+            "bring the door to the {side} end",
+        ),
     ),
     "open_drawer": (
-        "open the drawer",
-        "pull the drawer open",
-        "pull the handle to open the drawer",
-        "grasp the drawer handle, then open it",
-        "slide the drawer out",
+        (
+            "(|go )(open|pull open) the drawer",
+            "(pull|grasp) the (|drawer )handle (and|to) open (it|the drawer)",
+            "(slide|pull) the drawer out",
+        ),
+        ("make the drawer come out", "take hold of the drawer's handle and pull", "get the drawer open"),
     ),
     "close_drawer": (
-        "close the drawer",
-        "push the drawer shut",
-        "push the handle to close the drawer",
-        "shut the drawer",
-        "slide the drawer back in",
+        (
+            "(|go )(close|shut) the drawer",
+            "(push|grasp) the (|drawer )handle (and|to) close (it|the drawer)",
+            "(slide|push) the drawer in",
+        ),
+        ("push the drawer back into the desk", "make sure the drawer is shut", "get the drawer closed"),
     ),
     "lift_{color}_block_table": (
-        "lift the {color} block from the table",
-        "grasp the {color} block on the table and lift it up",
-        "pick up the {color} block from the table",
-        "take the {color} block off the table",
-        "raise the {color} block that lies on the table",
+        (
+            f"(lift|pick up|raise) {_BLOCK} (from|on) the table",
+            f"(take|grasp|grab) {_BLOCK} on the table and (lift it up|raise it)",
+            f"(lift|pick) {_BLOCK} up",
+        ),
+        (
+            "take the {color} block off the table",
+            "on the table, get hold of the {color} block and bring it up",
+            "raise the {color} block that lies on the table",
+        ),
     ),
     "lift_{color}_block_slider": (
-        "lift the {color} block lying in the cabinet",
-        "grasp the {color} block on the shelf and lift it up",
-        "pick up the {color} block from the sliding cabinet",
-        "take the {color} block out of the cabinet",
-        "raise the {color} block that lies on the shelf",
+        (
+            f"(lift|pick up|raise) {_BLOCK} (from|in) the (|sliding )cabinet",
+            f"(take|grasp|grab) {_BLOCK} (|lying )in the cabinet and (lift it up|raise it)",
+            f"in the cabinet (grasp|lift) {_BLOCK}",
+        ),
+        (
+            "take the {color} block out of the sliding cabinet",
+            "from the shelf, get hold of the {color} block and bring it up",
+            "raise the {color} block that lies on the shelf",
+        ),
     ),
     "lift_{color}_block_drawer": (
-        "lift the {color} block lying in the drawer",
-        "grasp the {color} block in the drawer and lift it up",
-        "pick up the {color} block from the drawer",
-        "take the {color} block out of the drawer",
-        "raise the {color} block that lies in the drawer",
+        (
+            f"(lift|pick up|raise) {_BLOCK} (from|in) the drawer",
+            f"(take|grasp|grab) {_BLOCK} (|lying )in the drawer and (lift it up|raise it)",
+            f"go towards {_BLOCK} in the drawer and lift it",
+        ),
+        (
+            "take the {color} block out of the drawer",
+            "inside the drawer, get hold of the {color} block and bring it up",
+            "raise the {color} block that lies in the drawer",
+        ),
     ),
     "place_in_slider": (
-        "place the grasped object in the cabinet",
-        "put the block into the sliding cabinet",
-        "store the block you hold on the shelf",
-        "set the object down in the cabinet",
-        "lay the block behind the sliding door",
+        (
+            "(place|put|set) the (grasped |)(object|block) (in|into) the (|sliding )cabinet",
+            "(store|lay) the (object|block) in the cabinet",
+        ),
+        (
+            "set what you hold down behind the sliding door",
+            "leave the block on the shelf",
+            "put it into the cabinet",
+        ),
     ),
     "place_in_drawer": (
-        "place the grasped object in the drawer",
-        "put the block into the drawer",
-        "store the block you hold in the drawer",
-        "set the object down in the drawer",
-        "drop the block into the open drawer",
+        (
+            "(place|put|set|drop) the (grasped |)(object|block) (in|into) the (|open )drawer",
+            "(store|lay) the (object|block) in the drawer",
+        ),
+        (
+            "set what you hold down in the drawer",
+            "leave the block inside the drawer",
+            "let go of it over the drawer",
+        ),
     ),
     "stack_block": (
-        "stack the grasped block on top of another block",
-        "place the block on top of another block",
-        "put the block you hold onto another one",
-        "build a stack with the block",
-        "set the object down on a different block",
+        (
+            "(stack|place|put) the (grasped |)(object|block) on top of another (object|block)",
+            "(stack|put) the (grasped |)block (on|onto) another one",
+            "stack the blocks",
+        ),
+        (
+            "set what you hold down on a different block",
+            "build a tower of two blocks",
+            "leave the block standing on another one",
+        ),
     ),
     "unstack_block": (
-        "take off the stacked block",
-        "remove the top block",
-        "take the upper block down from the stack",
-        "lift the block off the one below it",
-        "unstack the blocks",
+        (
+            "(take off|remove|take down) the (stacked|top|upper) block",
+            "(unstack|take apart) the (blocks|stack|tower)",
+            "(take|lift) the (top|upper) block (off|from) the (stack|tower)",
+        ),
+        (
+            "free the lower block of the one on it",
+            "pick the highest block off the pile",
+            "undo the tower of blocks",
+        ),
     ),
     "turn_on_lightbulb": (
-        "turn on the light bulb",
-        "push the switch up to turn on the yellow light",
-        "move the light switch upwards",
-        "switch the yellow lamp on",
-        "use the switch to light the bulb",
+        (
+            "(turn|switch) on the (light bulb|yellow light|yellow lamp|bulb)",
+            "(push|move|slide) the switch (up|upwards) (|to turn on the (light|bulb))",
+        ),
+        (
+            "make the bulb glow yellow",
+            "flip the light switch to its upper end",
+            "use the switch to light the lamp",
+        ),
     ),
     "turn_off_lightbulb": (
-        "turn off the light bulb",
-        "push the switch down to turn off the yellow light",
-        "move the light switch downwards",
-        "switch the yellow lamp off",
-        "use the switch to put out the bulb",
+        (
+            "(turn|switch) off the (light bulb|yellow light|yellow lamp|bulb)",
+            "(push|move|slide) the switch (down|downwards) (|to turn off the (light|bulb))",
+        ),
+        (
+            "make the bulb go dark",
+            "flip the light switch to its lower end",
+            "use the switch to put out the lamp",
+        ),
     ),
     "turn_on_led": (
-        "turn on the led",
-        "press the button to turn on the green light",
-        "push the button so that the led lights up",
-        "switch the green light on",
-        "toggle the button to light the led",
+        (
+            "(turn|switch) on the (led|led light|green light|green lamp)",
+            "(press|push) the button to (turn|switch) on the (led|green light)",
+        ),
+        (
+            "make the led shine green",
+            "touch the button so that the led lights up",
+            "get the green light to shine",
+        ),
     ),
     "turn_off_led": (
-        "turn off the led",
-        "press the button to turn off the green light",
-        "push the button so that the led goes dark",
-        "switch the green light off",
-        "toggle the button to put out the led",
+        (
+            "(turn|switch) off the (led|led light|green light|green lamp)",
+            "(press|push) the button to (turn|switch) off the (led|green light)",
+        ),
+        ("make the led go dark", "touch the button so that the led goes out", "get the green light to stop"),
     ),
     "push_into_drawer": (
-        "sweep the block into the drawer",
-        "push the object into the drawer",
-        "slide the block over the edge into the drawer",
-        "shove the block until it falls into the drawer",
-        "move the object into the open drawer by pushing it",
+        (
+            "(push|sweep|slide) the (object|block) into the (|open )drawer",
+            "(push|sweep|slide) the (object|block) off the table into the drawer",
+        ),
+        (
+            "shove a block over the edge so that it falls into the drawer",
+            "let the block drop into the drawer by pushing it",
+            "knock the block into the drawer",
+        ),
     ),
 }
+"""Task to patterns of training and of validation sentences; ``(a|b|)`` stands for one of a, b and nothing."""
+
+_ALTERNATIVES = re.compile(r"\(([^()]*)\)")
 
 
-def _expand() -> dict[str, list[str]]:
-    sentences = {}
-    for name, templates in _TEMPLATES.items():
-        for color in COLORS if "{color}" in name else ("",):
-            for side in ("left", "right") if "{side}" in name else ("",):
-                filled = [template.format(color=color, side=side) for template in templates]
-                sentences[name.format(color=color, side=side)] = filled
-    return {task: sentences[task] for task in TASKS}
+def expand(pattern: str) -> list[str]:
+    """All sentences of a pattern, in order.
+
+    >>> expand("(open|pull) the (|top )drawer")
+    ['open the drawer', 'open the top drawer', 'pull the drawer', 'pull the top drawer']
+    """
+    inner = _ALTERNATIVES.search(pattern)
+    if inner is None:
+        return [" ".join(pattern.split())]
+    before, after = pattern[: inner.start()], pattern[inner.end() :]
+    return [s for choice in inner[1].split("|") for s in expand(before + choice + after)]
 
 
-COMMANDS: dict[str, list[str]] = _expand()
-"""Task to sentences; evaluations use the first one of a task."""
+def _sentences(kind: int) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name, patterns in _GRAMMAR.items():
+        colors = COLORS if "{color}" in name else ("",)
+        sides = ("left", "right") if "{side}" in name else ("",)
+        for color, side in itertools.product(colors, sides):
+            filled = (pattern.format(color=color, side=side) for pattern in patterns[kind])
+            listed = dict.fromkeys(sentence for pattern in filled for sentence in expand(pattern))
+            found[name.format(color=color, side=side)] = list(listed)
+    return {task: found[task] for task in TASKS}
 
 
-def load_commands(file: str | Path | None) -> dict[str, list[str]]:
-    """Sentences by task: :data:`COMMANDS`, or those of ``file`` where it has any.
+COMMANDS: dict[str, dict[str, list[str]]] = {"training": _sentences(0), "validation": _sentences(1)}
+"""Split to task to sentences. Evaluations use a task's first validation sentence."""
+
+
+def load_commands(file: str | Path | None, split: str) -> dict[str, list[str]]:
+    """Sentences by task: those of :data:`COMMANDS`, or those of ``file`` for the tasks that it has.
 
     Args:
         file: YAML, task name to a sentence or a list of sentences, as in CALVIN's annotation files; or None.
+        split: ``"training"`` or ``"validation"``.
 
     Raises:
         DeskError: The file is missing, is not of that form, or names a task that does not exist.
     """
+    commands = dict(COMMANDS[split])
     if file is None:
-        return COMMANDS
+        return commands
     path = Path(file)
     if not path.is_file():
         raise DeskError(f"annotations file {path} does not exist")
@@ -167,7 +261,6 @@ def load_commands(file: str | Path | None) -> dict[str, list[str]]:
         raise DeskError(
             f"annotations file {path} must map task names to sentences, got {type(content).__name__}"
         )
-    commands = dict(COMMANDS)
     for task, sentences in content.items():
         if task not in TASKS:
             raise DeskError(f"annotations file {path} names the unknown task {task!r}")

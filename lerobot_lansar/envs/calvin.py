@@ -114,7 +114,7 @@ class CalvinEnv(gym.Env):
             "cameras": tuple(cameras),
             "renderer": renderer,
         }
-        self._sentences = load_commands(annotations)
+        self._sentences = load_commands(annotations, "validation")
         self._results_dir = None if results_dir is None else Path(results_dir)
         self._redraw_every = max(1, round(CONTROL_HZ / render_fps))
         self._max_episode_steps = steps_per_command * (CHAIN_LENGTH if task == LH_MTLC else 1)

@@ -1,0 +1,197 @@
+"""Runs work that is cut into shards, then one finishing step: in local processes, under Slurm or on Ray (datatrove).
+
+A shard's number decides what it does, so the result is the same wherever and however often it runs. Finished shards
+are remembered in the logging folder and not repeated.
+"""
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import multiprocess
+from datatrove.executor import LocalPipelineExecutor, RayPipelineExecutor, SlurmPipelineExecutor
+from datatrove.pipeline.base import PipelineStep
+from datatrove.utils.logging import logger
+from tqdm import tqdm
+
+EXECUTORS = ("local", "slurm", "ray")
+
+
+class WorkerDied(Exception):
+    """A local worker process ended without a word, killed by the system or a user."""
+
+
+@dataclass
+class SlurmConfig:
+    """How jobs are submitted to Slurm (``sbatch``); one array element runs ``shards_per_job`` shards."""
+
+    partition: str = ""
+    time: str = "24:00:00"
+    qos: str = "normal"
+    mem_per_cpu_gb: int = 4
+    shards_per_job: int = 1
+    # Further options of sbatch, for example account.
+    sbatch_args: dict[str, str] = field(default_factory=dict)
+
+
+class Step(PipelineStep):
+    """One step of datatrove's, made of a function of the shard's number. It is pickled, so the function must be a
+    module's own, with its arguments in ``arguments``.
+    """
+
+    name = "lansar"
+    type = "work"
+
+    def __init__(self, function: Callable[..., None], arguments: tuple[Any, ...], quiet: bool):
+        super().__init__()
+        self.function, self.arguments, self.quiet = function, arguments, quiet
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self.quiet:
+            logger.disable("datatrove")
+        if multiprocess.parent_process() is not None:
+            _end_with_parent()
+
+    def run(self, data: Any, rank: int = 0, world_size: int = 1) -> None:
+        with self.track_time():
+            self.function(*self.arguments, rank)
+
+
+def run_shards(
+    work: tuple[Callable[..., None], tuple[Any, ...]],
+    shards: int,
+    finish: tuple[Callable[..., None], tuple[Any, ...]],
+    *,
+    executor: str,
+    workers: int,
+    slurm: SlurmConfig,
+    logging_dir: Path,
+    progress: Callable[[], int],
+    total: int,
+    unit: str,
+) -> bool:
+    """Calls ``work`` for every shard and ``finish`` once after them.
+
+    Args:
+        work: A function and its first arguments; the shard's number comes last.
+        shards: How many there are.
+        finish: A function and its first arguments; it too is called with a number, 0.
+        executor: One of :data:`EXECUTORS`.
+        workers: Processes at a time; with Slurm the array's limit of tasks at a time.
+        slurm: Used by the executor of that name.
+        logging_dir: Where finished shards are remembered and logs are kept.
+        progress: How many of ``total`` units are done, for the bar of the local executor.
+        total, unit: Of the bar.
+
+    Returns:
+        Whether all is done; False when jobs were submitted that go on without this process.
+
+    Raises:
+        WorkerDied: A local worker was killed; the same call goes on where it stopped.
+        Exception: Whatever ``work`` or ``finish`` raised.
+    """
+    quiet = executor == "local"
+    steps = [Step(*work, quiet), Step(*finish, quiet)]
+    folders = [str(logging_dir / name) for name in ("work", "finish")]
+    if executor == "slurm":
+        first = SlurmPipelineExecutor(
+            [steps[0]], shards, workers=workers, tasks_per_job=slurm.shards_per_job, logging_dir=folders[0],
+            job_name="lansar", **_slurm_options(slurm),
+        )  # fmt: skip
+        last = SlurmPipelineExecutor(
+            [steps[1]],
+            1,
+            logging_dir=folders[1],
+            job_name="lansar-finish",
+            depends=first,
+            **_slurm_options(slurm),
+        )
+        last.run()
+        return False
+    if executor == "ray":
+        import ray
+
+        if not ray.is_initialized():
+            ray.init()
+        RayPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0]).run()
+    else:
+        logger.disable("datatrove")
+        local = LocalPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
+        with _watched(progress, total, unit):
+            local.run()
+    steps[1].run(None)
+    return True
+
+
+def _slurm_options(slurm: SlurmConfig) -> dict[str, Any]:
+    return {
+        "time": slurm.time,
+        "partition": slurm.partition,
+        "qos": slurm.qos,
+        "mem_per_cpu_gb": slurm.mem_per_cpu_gb,
+        "sbatch_args": dict(slurm.sbatch_args),
+        "venv_path": str(Path(os.environ["VIRTUAL_ENV"]) / "bin" / "activate")
+        if "VIRTUAL_ENV" in os.environ
+        else None,
+        "mail_type": "NONE",
+    }
+
+
+_following = False
+
+
+def _end_with_parent() -> None:
+    """A killed parent must not leave writers behind: its workers notice within a moment and end."""
+    global _following
+    if _following:
+        return
+    _following = True
+    parent = os.getppid()
+
+    def follow() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _watched(progress: Callable[[], int], total: int, unit: str) -> Iterator[None]:
+    """A bar over local work. A pool waits forever for a worker that was killed: here that ends in WorkerDied."""
+    ended, died = threading.Event(), threading.Event()
+
+    def watch() -> None:
+        known: set[int] = set()
+        with tqdm(total=total, initial=progress(), desc="recording", unit=unit) as bar:
+            while not ended.wait(0.3):
+                if new := progress() - bar.n:
+                    bar.update(new)
+                pool = {p.pid for p in multiprocess.active_children() if "PoolWorker" in p.name}
+                if known - pool and not ended.wait(3):
+                    died.set()
+                    os.kill(os.getpid(), signal.SIGINT)
+                    return
+                known = pool
+            bar.update(progress() - bar.n)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    except KeyboardInterrupt:
+        if died.is_set():
+            raise WorkerDied(
+                "a worker process was killed (out of memory?); run the same command again to go on"
+            ) from None
+        raise
+    finally:
+        ended.set()
+        thread.join()
