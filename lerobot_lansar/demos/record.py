@@ -34,7 +34,7 @@ class RecordConfig:
 
     output_dir: Path
     # One scene, or a list of them that share the recording evenly: --scene='[A,B,C]'.
-    scene: str | list[str] = "D"
+    scene: list[str] | str = "D"
     # windows: one episode for each command; play: tasks follow each other without a reset, windows are cut from it.
     mode: str = "windows"
     # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
