@@ -81,7 +81,7 @@ def carry_out(
                 return
             action = motion.toward(waypoint, obs["robot_obs"])
             frame = {**obs, "actions": action, "rel_actions": relative_action(action, obs["robot_obs"])}
-            obs = desk.step(disturbance.of(action), control_mode="abs")
+            obs = desk.step(disturbance.of(action, careful=waypoint.slow < 1), control_mode="abs")
             view.robot_obs, view.scene_obs = obs["robot_obs"], obs["scene_obs"]
             snapshot = desk.snapshot()
             yield frame, obs, snapshot
