@@ -123,6 +123,7 @@ def run_shards(
         RayPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0]).run()
     else:
         logger.disable("datatrove")
+        os.register_at_fork(after_in_child=_end_with_parent)  # the process that keeps datatrove's queue
         local = LocalPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
         with _watched(progress, total, unit):
             local.run()
@@ -144,15 +145,15 @@ def _slurm_options(slurm: SlurmConfig) -> dict[str, Any]:
     }
 
 
-_following = False
+_following = 0  # the process that does
 
 
 def _end_with_parent() -> None:
-    """A killed parent must not leave writers behind: its workers notice within a moment and end."""
+    """A killed parent must not leave anyone behind: its children notice within a moment and end."""
     global _following
-    if _following:
+    if _following == os.getpid():
         return
-    _following = True
+    _following = os.getpid()
     parent = os.getppid()
 
     def follow() -> None:

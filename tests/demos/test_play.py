@@ -34,7 +34,7 @@ def test_enter_keeps_demonstrations_that_fulfil_a_task(tmp_path):
         video=tmp_path / "v.mp4",
     )
     session = play.play(config)
-    assert [recording.task for recording in session.kept] == ["turn_on_led"]
+    assert [window[2] for _, unit, _ in session.kept for window in unit.windows] == ["turn_on_led"]
     split = CalvinSplit(tmp_path / "mine", "training")
     (window,) = split.windows
     assert window.task == "turn_on_led"
