@@ -7,6 +7,7 @@ are remembered in the logging folder and not repeated.
 import contextlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +25,7 @@ EXECUTORS = ("local", "slurm", "ray")
 
 
 class WorkerDied(Exception):
-    """A local worker process ended without a word, killed by the system or a user."""
+    """Workers ended without a word, killed by the system or a user, or failed on another machine."""
 
 
 @dataclass
@@ -120,7 +121,12 @@ def run_shards(
 
         if not ray.is_initialized():
             ray.init()
-        RayPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0]).run()
+        remote = RayPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
+        remote.run()
+        if missing := remote.get_incomplete_ranks(skip_completed=True):
+            raise WorkerDied(
+                f"{len(missing)} of {shards} shards failed on Ray; their logs are in {folders[0]}/logs"
+            )
     else:
         logger.disable("datatrove")
         os.register_at_fork(after_in_child=_end_with_parent)  # the process that keeps datatrove's queue
@@ -138,9 +144,8 @@ def _slurm_options(slurm: SlurmConfig) -> dict[str, Any]:
         "qos": slurm.qos,
         "mem_per_cpu_gb": slurm.mem_per_cpu_gb,
         "sbatch_args": dict(slurm.sbatch_args),
-        "venv_path": str(Path(os.environ["VIRTUAL_ENV"]) / "bin" / "activate")
-        if "VIRTUAL_ENV" in os.environ
-        else None,
+        # datatrove's own commands must be found where the jobs run
+        "venv_path": str(Path(sys.prefix) / "bin" / "activate") if sys.prefix != sys.base_prefix else None,
         "mail_type": "NONE",
     }
 

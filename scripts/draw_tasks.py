@@ -1,4 +1,4 @@
-"""Draws docs/images/tasks.jpg: a demonstration of each of the 34 tasks, six moments of it, in scenes A, B, C, D in turn.
+"""Draws docs/images/tasks.jpg: a demonstration of each of the 34 tasks, six moments of it, scenes A to D in turn.
 
 python scripts/draw_tasks.py [--assets=DIR] [--output=FILE]
 """

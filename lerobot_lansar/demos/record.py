@@ -26,6 +26,8 @@ from .skills import SKILLS
 ATTEMPTS = 20
 SPLITS = ("training", "validation")
 STAGING = ".recording"
+SLURM_LOGS = "slurm"
+"""Where Slurm's jobs keep their logs; they outlive the staging folder."""
 
 
 @dataclass
@@ -158,7 +160,7 @@ def record(config: RecordConfig) -> Path:
             executor=config.executor,
             workers=config.workers,
             slurm=config.slurm,
-            logging_dir=staging / "jobs",
+            logging_dir=output / SLURM_LOGS if config.executor == "slurm" else staging / "jobs",
             progress=lambda: len(list(staging.glob("[0-9]*.json"))),
             total=total,
             unit="episode" if config.mode == "windows" else "session",
@@ -312,6 +314,7 @@ def _claim(staging: Path, config: RecordConfig) -> None:
                 f"{file}"
             )
         return
+    shutil.rmtree(staging.parent / SLURM_LOGS, ignore_errors=True)  # it remembers shards of another recording
     for leftover in staging.iterdir():  # without its request nothing tells what these episodes are
         shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
     partial = file.with_suffix(".partial")
@@ -332,4 +335,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    # workers on other machines know these functions by their module's real name
+    from lerobot_lansar.demos.record import main as run
+
+    run()
