@@ -19,6 +19,7 @@ BIN = Path(sys.executable).parent
 DATA = Path("data/quickstart")
 OUT = Path("outputs/quickstart")
 CONFIG = "configs/quickstart.yaml"
+COMMANDS = "configs/quickstart_commands.yaml"
 TASKS = [
     "open_drawer",
     "close_drawer",
@@ -78,6 +79,7 @@ def record_and_convert() -> None:
             "--episodes=1320",
             "--validation_episodes=55",
             "--cameras=[]",
+            f"--annotations={COMMANDS}",
             "--seed=0",
             "--workers=2",
             f"--output_dir={DATA}",
@@ -118,6 +120,7 @@ def evaluate(name: str, checkpoint: Path, log: Path | None = None) -> Path:
             f"--env.task={','.join(TASKS)}",
             "--env.control_mode=abs",
             "--env.cameras=[]",
+            f"--env.annotations={COMMANDS}",
             "--env.render_fps=6",
             f"--env.results_dir={folder}",
             f"--eval.n_episodes={EPISODES_PER_TASK}",

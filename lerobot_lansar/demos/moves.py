@@ -23,6 +23,8 @@ INTO_CABINET = 0.5
 """How far (rad) a hand leans forward to reach past the cabinet's lid and door."""
 TABLE_FRONT = -0.18
 """y of the table's front edge (m): the drawer comes out from under it."""
+TRIES = 4
+"""How often a skill begins anew before it gives up."""
 
 Skill = Callable[["View"], Iterator["Waypoint"]]
 

@@ -13,7 +13,8 @@ from ..desk.starts import REACH, TABLE_Z, sample_start
 from .calvin_folder import FrameWriter, Unit
 from .demonstrator import MAX_STEPS, carry_out
 from .moves import Skill, Style, View, Waypoint, lying
-from .skills import SKILLS, put_down
+from .skills import SKILLS
+from .skills.blocks import put_down
 
 WINDOW = 64
 """Frames in a language window at most (CALVIN)."""

@@ -191,8 +191,8 @@ def _on(scene: Scene, place: str, rng: np.random.Generator) -> np.ndarray:
 
 def _arm(desk: Desk, holding: bool, rng: np.random.Generator) -> np.ndarray | None:
     """``robot_obs`` (15,) of a random pose above the table, gripper down, or None when the arm cannot reach it."""
-    position = np.array([rng.uniform(-0.25, 0.30), rng.uniform(-0.32, -0.08), rng.uniform(0.53, 0.66)])
-    euler = np.array([np.pi + rng.normal(0, 0.05), rng.normal(0, 0.05), np.pi / 2 + rng.uniform(-0.4, 0.4)])
+    position = np.array([rng.uniform(-0.32, 0.38), rng.uniform(-0.36, -0.06), rng.uniform(0.51, 0.70)])
+    euler = np.array([np.pi + rng.normal(0, 0.1), rng.normal(0, 0.1), np.pi / 2 + rng.uniform(-0.7, 0.7)])
     if holding:
         euler[:2] = np.pi, 0.0
     desk.reset(None, _away())

@@ -1,23 +1,20 @@
-"""How a hand does each of the 34 tasks: generators of waypoints that look at the desk's present state before each one.
-
-A skill goes on until the demonstrator stops it because the oracle is satisfied, or until it has tried often enough.
-Distances come from the desk's measured geometry: handle and lever sizes, button height, block sizes.
-"""
+"""Taking, carrying, setting down, stacking, turning and pushing blocks."""
 
 from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
-from ..desk import COLORS
-from ..desk.scenes import BLOCK_SIDE, BUTTON_TRAVEL
-from ..desk.starts import DRAWER_Z, TABLE_Z
-from .moves import (
+from ...desk import COLORS
+from ...desk.scenes import BLOCK_SIDE
+from ...desk.starts import DRAWER_Z, TABLE_Z
+from ..moves import (
     CLOSED,
     FORWARD,
     INTO_CABINET,
     OPEN,
     TABLE_FRONT,
+    TRIES,
     YAWS,
     Skill,
     View,
@@ -33,106 +30,11 @@ from .moves import (
     turned,
 )
 
-HANDLE_Z = 0.365
-"""Height (m) at which the hand pulls and pushes the drawer's handle."""
 EDGE = 0.415
 """|x| (m) up to which blocks are set down on the table, which ends at 0.44."""
-TRIES = 4
-"""How often a skill begins anew before it gives up."""
 
 
-# ---- the desk's parts
-
-
-def open_drawer(view: View) -> Iterator[Waypoint]:
-    """Reach behind the handle's bar from above and pull; pull again if the drawer stopped short."""
-    x = view.scene.drawer_x + view.scatter(0.06)
-    for _ in range(TRIES):
-        gap = -0.211 - view.drawer
-        yield from travel(view, (x, gap, 0.53), view.style.idle_gripper)
-        yield view.go((x, gap, 0.52 + view.scatter(0.02)), tolerance=0.015)
-        yield view.go((x, gap, HANDLE_Z), slow=0.8, tolerance=0.01)
-        yield view.go((x, gap - 0.24, HANDLE_Z + view.scatter(0.005)), slow=0.8)
-
-
-def close_drawer(view: View) -> Iterator[Waypoint]:
-    """Go in front of the handle's bar and push."""
-    x = view.scene.drawer_x + view.scatter(0.07)
-    for _ in range(TRIES):
-        front = -0.2612 - view.drawer - 0.05
-        yield from travel(view, (x, front, 0.50), view.style.idle_gripper)
-        yield view.go((x, front, 0.48 + view.scatter(0.03)), tolerance=0.02)
-        yield view.go((x, front, HANDLE_Z), slow=0.9, tolerance=0.015)
-        yield view.go((x, -0.2612 + 0.03, HANDLE_Z + view.scatter(0.005)), slow=0.8)
-
-
-def press_button(view: View) -> Iterator[Waypoint]:
-    """Press the LED's button from above; let go and press again if the light did not change."""
-    for _ in range(TRIES):
-        x, y = view.scene.button_x + view.scatter(0.012), -0.12 + view.scatter(0.012)
-        yield from travel(view, (x, y, 0.56), view.style.idle_gripper)
-        yield view.go((x, y, 0.54 + view.scatter(0.015)), tolerance=0.015)
-        yield view.go((x, y, 0.483 - BUTTON_TRAVEL), slow=0.7, tolerance=0.006)
-        yield view.go((x, y, 0.54))
-
-
-def _slide(direction: float) -> Skill:
-    def skill(view: View) -> Iterator[Waypoint]:
-        """Go beside the door's handle and push it along."""
-        for _ in range(TRIES):
-            # the handle is 0.042 m wide around this x and moves to -x as the joint grows
-            handle = view.scene.slide_x + 0.14 - view.scene_obs[0]
-            beside = handle - direction * (0.021 + 0.05 + abs(view.scatter(0.015)))
-            end = view.scene.slide_x + 0.14 - (view.scene.slide_travel if direction < 0 else 0.0)
-            z = 0.53 + view.scatter(0.006)
-            yield from travel(view, (beside, -0.07, 0.58), view.style.idle_gripper)
-            yield view.go((beside, -0.06, 0.58), tolerance=0.02)
-            yield view.go((beside, -0.012, z), slow=0.9)
-            yield view.go((end + direction * 0.05, -0.012, z), slow=0.85)
-            yield view.go((view.tcp[0] - direction * 0.03, -0.09, 0.58))
-
-    return skill
-
-
-def _lever(view: View) -> np.ndarray:
-    """Middle of the switch's bar, (3,) m: it slides up the cabinet's front, which leans back by 30 degrees."""
-    way = view.scene_obs[3]
-    return np.array([view.scene.switch_x, 0.019 + 0.5 * way, 0.528 + 0.866 * way])
-
-
-def _reaching(view: View) -> np.ndarray:
-    """Fingers forward and outward: how the arm reaches the lever, which a hand pointing straight down does not."""
-    return np.array([np.pi - 0.5 * np.sign(view.scene.switch_x), -0.6, FORWARD])
-
-
-def turn_on_lightbulb(view: View) -> Iterator[Waypoint]:
-    """Reach under the lever with a tilted hand and push it up along the cabinet's front."""
-    tilt = _reaching(view)
-    for _ in range(TRIES):
-        x, lever = view.scatter(0.02), _lever(view)
-        before = lever + [x, -0.08, -0.02]
-        yield from travel(view, before + [0, -0.04, 0], view.style.idle_gripper, tilt)
-        yield view.go(before, CLOSED, tilt, tolerance=0.02)
-        yield view.go(lever + [x, -0.01, -0.035], CLOSED, tilt, slow=0.9)
-        for up in np.linspace(0.0, 0.12, 6):
-            yield view.go(lever + [x, 0.55 * up, up - 0.03], CLOSED, tilt, slow=0.8)
-        yield view.go(view.tcp + [0, -0.08, 0], CLOSED, tilt, tolerance=0.03)
-
-
-def turn_off_lightbulb(view: View) -> Iterator[Waypoint]:
-    """Reach over the lever with a tilted hand and press it down along the cabinet's front."""
-    tilt = _reaching(view)
-    for _ in range(TRIES):
-        x, lever = view.scatter(0.02), _lever(view)
-        yield from travel(view, lever + [x, -0.09, 0.09], view.style.idle_gripper, tilt)
-        yield view.go(lever + [x, -0.03, 0.09], CLOSED, tilt, tolerance=0.02)
-        yield view.go(lever + [x, 0.005, 0.045], CLOSED, tilt, slow=0.9)
-        for down in np.linspace(0.0, 0.11, 6):
-            yield view.go(lever + [x, 0.005 - 0.55 * down, 0.03 - down], CLOSED, tilt, slow=0.8)
-        yield view.go(view.tcp + [0, -0.08, 0.02], CLOSED, tilt, tolerance=0.03)
-
-
-# ---- blocks: taking
+# ---- taking
 
 
 def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
@@ -210,7 +112,7 @@ def _take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     yield view.go(view.tcp.copy(), CLOSED, euler, hold=4, tolerance=0.02)
 
 
-def _lift(color: str) -> Skill:
+def lift(color: str) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Take the block and raise it; take it again if it slipped."""
         for _ in range(TRIES):
@@ -252,7 +154,7 @@ def _top_of_stack(view: View) -> str | None:
     return None
 
 
-# ---- blocks: bringing
+# ---- bringing
 
 
 def _bring(
@@ -400,10 +302,10 @@ def _covered(view: View, color: str, in_hand: str) -> bool:
     return any(0.03 < gap[2] < 0.09 and np.linalg.norm(gap[:2]) < 0.05 for gap in above)
 
 
-# ---- blocks: turning and pushing
+# ---- turning and pushing
 
 
-def _rotate(color: str, direction: float) -> Skill:
+def rotate(color: str, direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Take the block where it lies, turn the wrist and let go; turn on if that was not far enough."""
         wanted = direction * (1.3 + view.scatter(0.1))
@@ -483,7 +385,7 @@ def _carry(view: View, color: str, place: np.ndarray) -> Iterator[Waypoint]:
     yield view.go(target + [0, 0, 0.09], OPEN, lean, tolerance=0.02)
 
 
-def _push(color: str, direction: float) -> Skill:
+def push(color: str, direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Push the block along; carry it where the button's rim or another block is in the way."""
         begin = view.block(color)[0]
@@ -579,30 +481,3 @@ def put_down(view: View) -> Iterator[Waypoint]:
     if color is not None:
         place = np.array([*_landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
         yield from _bring(view, color, place, pointing(turned(view.robot_obs[5]), *stretch(place)), 0.55)
-
-
-SKILLS: dict[str, Skill] = {
-    **{f"rotate_{color}_block_right": _rotate(color, -1.0) for color in COLORS},
-    **{f"rotate_{color}_block_left": _rotate(color, 1.0) for color in COLORS},
-    **{f"push_{color}_block_right": _push(color, 1.0) for color in COLORS},
-    **{f"push_{color}_block_left": _push(color, -1.0) for color in COLORS},
-    "move_slider_left": _slide(-1.0),
-    "move_slider_right": _slide(1.0),
-    "open_drawer": open_drawer,
-    "close_drawer": close_drawer,
-    **{
-        f"lift_{color}_block_{place}": _lift(color)
-        for color in COLORS
-        for place in ("table", "slider", "drawer")
-    },
-    "place_in_slider": place_in_slider,
-    "place_in_drawer": place_in_drawer,
-    "stack_block": stack_block,
-    "unstack_block": unstack_block,
-    "turn_on_lightbulb": turn_on_lightbulb,
-    "turn_off_lightbulb": turn_off_lightbulb,
-    "turn_on_led": press_button,
-    "turn_off_led": press_button,
-    "push_into_drawer": push_into_drawer,
-}
-"""How each of the 34 tasks is done."""
