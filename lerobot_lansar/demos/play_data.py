@@ -9,7 +9,7 @@ from ..desk import COLORS, TASKS, Desk, SimulationError, completed_tasks
 from ..desk.desk import Observation
 from ..desk.oracle import DRAWER, PLANK, TABLE, Snapshot
 from ..desk.scenes import DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
-from ..desk.starts import REACH, TABLE_Z, sample_start
+from ..desk.starts import REACH, TABLE_Z, beside_door, sample_start
 from .calvin_folder import FrameWriter, Unit
 from .demonstrator import MAX_STEPS, carry_out
 from .moves import Skill, Style, View, Waypoint, lying
@@ -172,8 +172,7 @@ def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[s
         tasks.append("push_into_drawer")
     for color in COLORS:
         block, (x, y, z) = snapshot.blocks[color], view.block(color)[:3]
-        door = scene.slide_x - slide
-        beside = x < door - 0.045 or x > door + 0.28 + 0.045
+        beside = beside_door(scene, slide, x)
         flat = lying(view.block(color))[1]
         if PLANK in block.contacts and not _under_another(snapshot, color) and beside and y < 0.125 and flat:
             tasks.append(f"lift_{color}_block_slider")

@@ -59,7 +59,7 @@ _GRAMMAR: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "(pull|grasp) the (|drawer )handle (and|to) open (it|the drawer)",
             "(slide|pull) the drawer out",
         ),
-        ("make the drawer come out", "take hold of the drawer's handle and pull", "get the drawer open"),
+        ("get the drawer open", "take hold of the drawer's handle and pull", "make the drawer come out"),
     ),
     "close_drawer": (
         (
@@ -67,7 +67,7 @@ _GRAMMAR: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "(push|grasp) the (|drawer )handle (and|to) close (it|the drawer)",
             "(slide|push) the drawer in",
         ),
-        ("push the drawer back into the desk", "make sure the drawer is shut", "get the drawer closed"),
+        ("get the drawer closed", "push the drawer back into the desk", "make sure the drawer is shut"),
     ),
     "lift_{color}_block_table": (
         (

@@ -14,6 +14,8 @@ TABLE_Z = 0.46
 DRAWER_Z = 0.362
 """Height of a block's centre in the drawer (m)."""
 
+DOOR_WIDTH = 0.28
+"""The cabinet's sliding door (m); its left edge is at the scene's ``slide_x`` minus the joint."""
 REACH = 0.41
 """|x| up to which blocks can be pushed and still lie on the table, which ends at 0.44 (m)."""
 
@@ -93,7 +95,7 @@ def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, go
         if abs(end) > REACH:
             return False
     if color is not None:
-        if task.endswith("_slider") and not _beside_door(desk.scene, got, color):
+        if task.endswith("_slider") and not beside_door(desk.scene, got[0], got[6 + 6 * COLORS.index(color)]):
             return False
         surface = {"slider": PLANK, "drawer": DRAWER}.get(task.rsplit("_", 1)[-1], TABLE)
         return snapshot.blocks[color].contacts == {surface}
@@ -102,11 +104,10 @@ def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, go
     return bool(np.allclose(got[[0, 1, 3, 4, 5]], wanted[[0, 1, 3, 4, 5]], atol=5e-3))
 
 
-def _beside_door(scene: Scene, state: np.ndarray, color: str) -> bool:
-    """Whether a finger fits between a block in the cabinet and the door's edge: 0.045 m from the block's middle."""
-    door = scene.slide_x - state[0]
-    x = state[6 + 6 * COLORS.index(color)]
-    return bool(x < door - 0.045 or x > door + 0.28 + 0.045)
+def beside_door(scene: Scene, slide: float, x: float) -> bool:
+    """Whether a finger fits between a block at ``x`` in the cabinet and the door's edge: 0.045 m from its middle."""
+    door = scene.slide_x - slide
+    return bool(x < door - 0.045 or x > door + DOOR_WIDTH + 0.045)
 
 
 def _color(task: str) -> str | None:

@@ -6,7 +6,7 @@ import pytest
 
 from dataset_convert.calvin import CalvinSplit
 from lerobot_lansar.demos import play
-from lerobot_lansar.demos.demonstrator import relative_action
+from lerobot_lansar.demos.motion import relative_action
 from lerobot_lansar.desk import Desk, DeskError, SimulationError
 
 

@@ -9,8 +9,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import lerobot_lansar  # noqa: F401  (registers the environment)
-from lerobot_lansar.demos.demonstrator import _error, _toward
-from lerobot_lansar.demos.skills import SKILLS, View
+from lerobot_lansar.demos.motion import Motion
+from lerobot_lansar.demos.moves import View
+from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import DeskError
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.benchmark import load_chains
@@ -23,12 +24,13 @@ def script(env, obs, tasks, seed=0):
     for task in tasks:
         state = obs["agent_pos"], obs["environment_state"]
         view = View(env.unwrapped._desk.scene, *state, np.random.default_rng(seed))
+        motion = Motion(view.robot_obs, 1.0)
         for waypoint in SKILLS[task](view):
-            for _ in range(70):
-                distance, turn = _error(waypoint, view.robot_obs)
-                if np.linalg.norm(distance) < waypoint.tolerance and np.abs(turn).max() < 0.12:
+            for held in range(70):
+                distance, turn = motion.error(waypoint, view.robot_obs)
+                if distance < waypoint.tolerance and turn < 0.12 and held >= waypoint.hold:
                     break
-                result = env.step(_toward(waypoint, view.robot_obs, distance, turn, 0.9))
+                result = env.step(motion.toward(waypoint, view.robot_obs))
                 obs = result[0]
                 view.robot_obs, view.scene_obs = obs["agent_pos"], obs["environment_state"]
                 yield result

@@ -8,6 +8,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
 import lerobot_policy_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.desk import DeskError
+from lerobot_lansar.desk.commands import COMMANDS
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 
 
@@ -38,7 +39,7 @@ def rollout(use_async: bool):
     assert list(envs) == ["open_drawer", "turn_on_led"]
     vector = envs["open_drawer"][0]
     obs, _ = vector.reset(seed=[3, 4], options={"lerobot_new_rollout": True})
-    assert vector.call("task_description") == ("open the drawer", "open the drawer")
+    assert vector.call("task_description") == (COMMANDS["validation"]["open_drawer"][0],) * 2
     assert vector.call("_max_episode_steps") == (4, 4)
     states, ends = [obs["agent_pos"]], []
     action = np.tile([1.0, 0, 0, 0, 0, 0, 1], (2, 1))

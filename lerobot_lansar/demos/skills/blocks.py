@@ -1,13 +1,13 @@
 """Taking, carrying, setting down, stacking, turning and pushing blocks."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
 
 from ...desk import COLORS
 from ...desk.scenes import BLOCK_SIDE
-from ...desk.starts import DRAWER_Z, TABLE_Z
+from ...desk.starts import DOOR_WIDTH, DRAWER_Z, TABLE_Z
 from ..moves import (
     CLOSED,
     FORWARD,
@@ -66,7 +66,7 @@ def _finger_room(view: View, x: float) -> tuple[float, float]:
     return min(low, middle), max(high, middle)
 
 
-def _coax(view: View, color: str) -> Iterator[Waypoint]:
+def _draw_in(view: View, color: str) -> Iterator[Waypoint]:
     """Slides a block that stands too near to a wall or to the door's edge inwards, with a fingertip on its top."""
     for _ in range(4):
         x, y = view.block(color)[:2]
@@ -92,7 +92,7 @@ def _coax(view: View, color: str) -> Iterator[Waypoint]:
 def _take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     """Brings the open hand around a block and closes it; ``turn`` (rad) is how far the wrist must turn afterwards."""
     if in_cabinet(view.block(color)):
-        yield from _coax(view, color)
+        yield from _draw_in(view, color)
     yaws = grasp_yaws(view, color)
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw + turn <= YAWS[1]] or yaws
     if not yaws:
@@ -123,7 +123,7 @@ def lift(color: str) -> Skill:
             back = view.robot_obs[3:6].copy()
             out = -approach(back) if in_cabinet(view.tcp) else np.array([0.0, 0.0, 1.0])
             high = 0.22 if view.tcp[2] < TABLE_Z - 0.05 else 0.13
-            yield view.go(view.tcp + high * out, CLOSED, back, slow=0.8, keep=lambda: view.holds(color))
+            yield view.go(view.tcp + high * out, CLOSED, back, slow=0.8, keep=partial(view.holds, color))
 
     return skill
 
@@ -157,95 +157,77 @@ def _top_of_stack(view: View) -> str | None:
 # ---- bringing
 
 
-def _bring(
-    view: View, color: str, position: np.ndarray, euler: np.ndarray, over: float
+def _set_down(
+    view: View, color: str, way: list[tuple[np.ndarray, float, float]], euler: np.ndarray
 ) -> Iterator[Waypoint]:
-    """Carries the block in the hand over a place at height ``over``, sets it down there and lets go."""
-
-    def keep() -> bool:
-        return view.holds(color)
-
-    yield from travel(view, (position[0], position[1], over), CLOSED, euler, keep)
-    yield view.go((position[0], position[1], over), CLOSED, euler, slow=0.9, tolerance=0.008, keep=keep)
-    yield view.go(position, CLOSED, euler, slow=0.7, tolerance=0.008, keep=keep)
+    """Carries the block in the hand along ``way`` (position, slow, tolerance), lets go at its end and draws back."""
+    keep = partial(view.holds, color)
+    yield from travel(view, way[0][0], CLOSED, euler, keep)
+    for position, slow, tolerance in way:
+        yield view.go(position, CLOSED, euler, slow=slow, tolerance=tolerance, keep=keep)
     if keep():
         yield view.go(view.tcp.copy(), OPEN, euler, tolerance=0.02, hold=4)
-        yield view.go(view.tcp - 0.08 * approach(euler), OPEN, euler, tolerance=0.02)
+        yield view.go(view.tcp - 0.1 * approach(euler), OPEN, euler, tolerance=0.02)
 
 
-def _last_held(view: View) -> str:
-    """The block in the hand, or the nearest to it if it has slipped already."""
-    return view.held() or min(
-        COLORS, key=lambda color: float(np.linalg.norm(view.block(color)[:3] - view.tcp))
-    )
+def _from_above(view: View, color: str, place: np.ndarray, yaw: float, over: float) -> Iterator[Waypoint]:
+    """Sets the block in the hand down at ``place``, which the hand reaches straight from height ``over``."""
+    above = np.array([place[0], place[1], over])
+    return _set_down(view, color, [(above, 0.9, 0.008), (place, 0.7, 0.008)], pointing(yaw, *stretch(place)))
 
 
-def _fetch(view: View, color: str) -> Iterator[Waypoint]:
-    """Takes a block that slipped from the hand, once it has come to rest."""
-    yield view.go(view.tcp.copy(), OPEN, view.robot_obs[3:6].copy(), tolerance=0.05, hold=8)
-    if not view.lost(color):
-        yield from _take(view, color)
+def _bringing(bring: Callable[[View, str], Iterator[Waypoint]]) -> Skill:
+    """A skill that brings the block in the hand somewhere, and takes it again where it slipped."""
+
+    def skill(view: View) -> Iterator[Waypoint]:
+        nearest = min(COLORS, key=lambda c: float(np.linalg.norm(view.block(c)[:3] - view.tcp)))
+        color = view.held() or nearest
+        for _ in range(2 * TRIES):
+            if view.lost(color):
+                return
+            if view.holds(color):
+                yield from bring(view, color)
+                continue
+            # once it has come to rest
+            yield view.go(view.tcp.copy(), OPEN, view.robot_obs[3:6].copy(), tolerance=0.05, hold=8)
+            if not view.lost(color):
+                yield from _take(view, color)
+
+    return skill
 
 
-def place_in_drawer(view: View) -> Iterator[Waypoint]:
+@_bringing
+def place_in_drawer(view: View, color: str) -> Iterator[Waypoint]:
     """Carry the block over the drawer, lower it and let go."""
-    color = _last_held(view)
-    for _ in range(2 * TRIES):
-        if view.lost(color):
-            return
-        if not view.holds(color):
-            yield from _fetch(view, color)
-            continue
-        y = (-0.157 - view.drawer + TABLE_FRONT) / 2
-        places = [np.array([view.scene.drawer_x + x, y, 0.0]) for x in (0.0, 0.05, -0.05, 0.1, -0.1)]
-        place = _freest(view, color, places) + [view.scatter(0.03), view.scatter(0.015), DRAWER_Z + 0.03]
-        yaw = turned(view.robot_obs[5])
-        yield from _bring(view, color, place, pointing(yaw, *stretch(place)), 0.55)
+    y = (-0.157 - view.drawer + TABLE_FRONT) / 2
+    places = [np.array([view.scene.drawer_x + x, y, 0.0]) for x in (0.0, 0.05, -0.05, 0.1, -0.1)]
+    place = _freest(view, color, places) + [view.scatter(0.03), view.scatter(0.015), DRAWER_Z + 0.03]
+    yield from _from_above(view, color, place, turned(view.robot_obs[5]), 0.55)
 
 
-def place_in_slider(view: View) -> Iterator[Waypoint]:
+@_bringing
+def place_in_slider(view: View, color: str) -> Iterator[Waypoint]:
     """Carry the block before the cabinet's open side, reach in with a leaning hand and let go."""
-    color = _last_held(view)
-    for _ in range(2 * TRIES):
-        if view.lost(color):
-            return
-        if not view.holds(color):
-            yield from _fetch(view, color)
-            continue
-        low, high = open_part(view)
-        middle, room = (low + high) / 2, max((high - low) / 2 - 0.07, 0.0)
-        places = [np.array([middle + s * room, 0.088, 0.0]) for s in (0.0, 0.5, -0.5, 1.0, -1.0)]
-        x = _freest(view, color, places)[0]
-        x = float(np.clip(x + view.scatter(0.02), middle - room, middle + room))
-        euler = pointing(_forward(view, color), 0.0, INTO_CABINET)
-
-        def keep() -> bool:
-            return view.holds(color)
-
-        yield from travel(view, (x, -0.10, 0.60), CLOSED, euler, keep)
-        yield view.go((x, -0.10, 0.60 + abs(view.scatter(0.02))), CLOSED, euler, tolerance=0.015, keep=keep)
-        yield view.go(
-            (x, 0.082 + view.scatter(0.01), 0.525), CLOSED, euler, slow=0.9, tolerance=0.01, keep=keep
-        )
-        yield view.go((x, 0.088, 0.480), CLOSED, euler, slow=0.7, tolerance=0.008, keep=keep)
-        if keep():
-            yield view.go(view.tcp.copy(), OPEN, euler, tolerance=0.02, hold=4)
-            yield view.go(view.tcp - 0.12 * approach(euler), OPEN, euler, tolerance=0.02)
-
-
-def _forward(view: View, color: str) -> float:
-    """The yaw nearest to :data:`FORWARD` for a hand that holds a block: the block's long side then points inwards."""
-    yaw = turned(view.robot_obs[5])
-    return float(yaw if abs(yaw - FORWARD) < 0.3 else FORWARD + np.clip(yaw - FORWARD, -0.3, 0.3))
+    low, high = open_part(view)
+    middle, room = (low + high) / 2, max((high - low) / 2 - 0.07, 0.0)
+    places = [np.array([middle + s * room, 0.088, 0.0]) for s in (0.0, 0.5, -0.5, 1.0, -1.0)]
+    x = _freest(view, color, places)[0]
+    x = float(np.clip(x + view.scatter(0.02), middle - room, middle + room))
+    before = np.array([x, -0.10, 0.60 + abs(view.scatter(0.02))])
+    inside = np.array([x, 0.082 + view.scatter(0.01), 0.525])
+    way = [(before, 1.0, 0.015), (inside, 0.9, 0.01), (np.array([x, 0.088, 0.480]), 0.7, 0.008)]
+    # the long side of the block points inwards
+    yaw = FORWARD + float(np.clip(turned(view.robot_obs[5]) - FORWARD, -0.3, 0.3))
+    yield from _set_down(view, color, way, pointing(yaw, 0.0, INTO_CABINET))
 
 
 def open_part(view: View, x: float | None = None) -> tuple[float, float]:
     """x range (m) of the cabinet that the door leaves open: the side on which ``x`` is, or else the wider one."""
     left, right = view.scene.cabinet
     door = view.scene.slide_x - view.scene_obs[0]
-    sides = ((left, door), (door + 0.28, right))
+    sides = ((left, door), (door + DOOR_WIDTH, right))
     if x is not None:
-        return sides[int(x > door + 0.14)]
+        return sides[int(x > door + DOOR_WIDTH / 2)]
     return max(sides, key=lambda side: side[1] - side[0])
 
 
@@ -260,29 +242,23 @@ def _freest(view: View, color: str, places: list[np.ndarray]) -> np.ndarray:
     return places[int(np.argmax(rooms))]
 
 
-def stack_block(view: View) -> Iterator[Waypoint]:
+@_bringing
+def stack_block(view: View, color: str) -> Iterator[Waypoint]:
     """Carry the block over another one, turn it the same way, lower it and let go."""
-    color = _last_held(view)
-    for _ in range(2 * TRIES):
-        if view.lost(color):
-            return
-        if not view.holds(color):
-            yield from _fetch(view, color)
-            continue
-        base = _best_base(view, color)
-        if base is None:
-            return
-        below = view.block(base)
-        now = turned(view.robot_obs[5])
-        yaws = [turned(lying(below)[0] + k * np.pi / 2) for k in range(4)]
-        yaws = [yaw for yaw in yaws if YAWS[0] <= yaw <= YAWS[1]]
-        yaw = min(yaws, key=lambda y: abs(y - now) + 2 * abs(np.sin(y - FORWARD)))
-        # the block may hang off the fingers' middle
-        hang = view.block(color)[:3] - view.tcp
-        place = below[:3] - [hang[0], hang[1], 0.0] + [0.0, 0.0, BLOCK_SIDE + 0.006 - min(hang[2], 0.0)]
-        if abs(yaw - now) > 0.3:  # what hangs off turns with the hand
-            place[:2] = below[:2]
-        yield from _bring(view, color, place, pointing(yaw, *stretch(place)), 0.57)
+    base = _best_base(view, color)
+    if base is None:
+        return
+    below = view.block(base)
+    now = turned(view.robot_obs[5])
+    yaws = [turned(lying(below)[0] + k * np.pi / 2) for k in range(4)]
+    yaws = [yaw for yaw in yaws if YAWS[0] <= yaw <= YAWS[1]]
+    yaw = min(yaws, key=lambda y: abs(y - now) + 2 * abs(np.sin(y - FORWARD)))
+    # the block may hang off the fingers' middle
+    hang = view.block(color)[:3] - view.tcp
+    place = below[:3] - [hang[0], hang[1], 0.0] + [0.0, 0.0, BLOCK_SIDE + 0.006 - min(hang[2], 0.0)]
+    if abs(yaw - now) > 0.3:  # what hangs off turns with the hand
+        place[:2] = below[:2]
+    yield from _from_above(view, color, place, yaw, 0.57)
 
 
 def _best_base(view: View, color: str) -> str | None:
@@ -312,9 +288,7 @@ def rotate(color: str, direction: float) -> Skill:
         start = lying(view.block(color))[0]
         origin = view.block(color)[:3].copy()
 
-        def keep() -> bool:
-            return view.holds(color)
-
+        keep = partial(view.holds, color)
         for _ in range(TRIES):
             if view.lost(color):
                 return
@@ -372,9 +346,7 @@ def _carry(view: View, color: str, place: np.ndarray) -> Iterator[Waypoint]:
         return
     euler = view.robot_obs[3:6].copy()
 
-    def keep() -> bool:
-        return view.holds(color)
-
+    keep = partial(view.holds, color)
     ground = view.tcp[2]
     yield view.go(view.tcp + [0, 0, 0.06], CLOSED, euler, slow=0.8, tolerance=0.015, keep=keep)
     target = np.array([*place, ground + 0.004])
@@ -480,4 +452,4 @@ def put_down(view: View) -> Iterator[Waypoint]:
     color = view.held()
     if color is not None:
         place = np.array([*_landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
-        yield from _bring(view, color, place, pointing(turned(view.robot_obs[5]), *stretch(place)), 0.55)
+        yield from _from_above(view, color, place, turned(view.robot_obs[5]), 0.55)
