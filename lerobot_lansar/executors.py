@@ -122,18 +122,18 @@ def run_shards(
         if not ray.is_initialized():
             ray.init()
         remote = RayPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
-        remote.run()
+        with _watched(progress, total, unit):
+            remote.run()
         if missing := remote.get_incomplete_ranks(skip_completed=True):
             raise WorkerDied(
                 f"{len(missing)} of {shards} shards failed on Ray; their logs are in {folders[0]}/logs"
             )
     else:
         logger.disable("datatrove")
-        os.register_at_fork(after_in_child=_end_with_parent)  # the process that keeps datatrove's queue
         local = LocalPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
-        with _watched(progress, total, unit):
+        with _watched(progress, total, unit), _forks_end_with_us():
             local.run()
-    steps[1].run(None)
+    finish[0](*finish[1], 0)
     return True
 
 
@@ -169,19 +169,36 @@ def _end_with_parent() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
+_watching = False
+
+
+@contextlib.contextmanager
+def _forks_end_with_us() -> Iterator[None]:
+    """The process in which datatrove keeps its queue is forked, and would outlive a killed parent."""
+    global _watching
+    _watching = True
+    try:
+        yield
+    finally:
+        _watching = False
+
+
+os.register_at_fork(after_in_child=lambda: _end_with_parent() if _watching else None)
+
+
 @contextlib.contextmanager
 def _watched(progress: Callable[[], int], total: int, unit: str) -> Iterator[None]:
-    """A bar over local work. A pool waits forever for a worker that was killed: here that ends in WorkerDied."""
+    """A bar. A pool waits forever for a local worker that was killed: here that ends in WorkerDied."""
     ended, died = threading.Event(), threading.Event()
 
     def watch() -> None:
         known: set[int] = set()
         with tqdm(total=total, initial=progress(), desc="recording", unit=unit) as bar:
-            while not ended.wait(0.3):
+            while not ended.wait(0.5):
                 if new := progress() - bar.n:
                     bar.update(new)
                 pool = {p.pid for p in multiprocess.active_children() if "PoolWorker" in p.name}
-                if known - pool and not ended.wait(3):
+                if known - pool and progress() < total and not ended.wait(5):
                     died.set()
                     os.kill(os.getpid(), signal.SIGINT)
                     return

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import shutil
+import socket
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,6 +19,11 @@ from ..desk.scenes import COLORS, Scene
 
 FRAME = "episode_{:07d}.npz"
 STATES = ("robot_obs", "scene_obs")
+
+
+def _process() -> str:
+    """A name that no other process has, on any machine."""
+    return f"{socket.gethostname()}-{os.getpid()}"
 
 
 @dataclass
@@ -44,7 +50,7 @@ class Unit:
 
     def save(self, file: Path) -> None:
         """Writes it down; the file appears in one go."""
-        partial = file.with_name(f".{file.name}-{os.getpid()}.partial")
+        partial = file.with_name(f"{file.name}-{_process()}.partial")
         partial.write_text(json.dumps(asdict(self)))
         partial.rename(file)
 
@@ -63,7 +69,7 @@ class FrameWriter:
 
     def __init__(self, folder: Path, scene: Scene):
         self._folder = folder
-        self._partial = folder.with_name(f"{folder.name}-{os.getpid()}.partial")
+        self._partial = folder.with_name(f"{folder.name}-{_process()}.partial")
         self._columns = _original_order(scene)
         self._sums: dict[str, np.ndarray] = {}
         self.frames = 0

@@ -81,7 +81,7 @@ def carry_out(
                 return
             action = motion.toward(waypoint, obs["robot_obs"])
             frame = {**obs, "actions": action, "rel_actions": relative_action(action, obs["robot_obs"])}
-            obs = desk.step(disturbance.of(action, careful=waypoint.slow < 1), control_mode="abs")
+            obs = desk.step(disturbance.of(action, waypoint.careful), control_mode="abs")
             view.robot_obs, view.scene_obs = obs["robot_obs"], obs["scene_obs"]
             snapshot = desk.snapshot()
             yield frame, obs, snapshot
@@ -120,7 +120,7 @@ def demonstrate(
     if task not in SKILLS:
         raise DeskError(f"task {task!r} is unknown; choose among: {', '.join(SKILLS)}")
     obs = desk.reset(*sample_start(desk, task, rng))
-    start, rows, done = desk.snapshot(), [], False
+    start, rows, stays = desk.snapshot(), [], 0
     for frame, _, snapshot in carry_out(
         desk,
         obs,
@@ -131,7 +131,7 @@ def demonstrate(
         fulfilled=lambda now: TASKS[task](start, now),
     ):
         rows.append(frame)
-        done = TASKS[task](start, snapshot)
-    if not done:
+        stays = stays + 1 if TASKS[task](start, snapshot) else 0
+    if stays <= AFTERWARDS:
         return None
     return Demonstration(task, {key: np.stack([row[key] for row in rows]) for key in rows[0]})

@@ -102,16 +102,15 @@ class Disturbance:
     def __init__(self, noise: float, rng: np.random.Generator):
         self._noise, self._rng = noise, rng
         self._push: np.ndarray = np.zeros(6)
-        self._pushed = self._slipped = 0
+        self._pushed = 0
 
     def of(self, action: np.ndarray, careful: bool) -> np.ndarray:
-        """The action that is really executed, (7,); half the noise and no new push while ``careful``."""
+        """The action that is really executed, (7,); half the noise and no push while ``careful``."""
         if self._rng.uniform() < 0.025 and self._pushed == 0 and not careful:
             self._push, self._pushed = self._rng.normal(0, 4 * self._noise, 6), 4
-        if self._slipped == 0 and self._rng.uniform() < 0.001 * self._noise:
-            self._slipped = 1
+        slips = self._rng.uniform() < 0.002 * self._noise
         units = self._rng.normal(0, self._noise * (0.5 if careful else 1.0), 6)
-        units += self._push if self._pushed else 0.0
-        gripper = -action[6:] if self._slipped else action[6:]
-        self._pushed, self._slipped = max(self._pushed - 1, 0), max(self._slipped - 1, 0)
+        units += self._push if self._pushed and not careful else 0.0
+        gripper = -action[6:] if slips else action[6:]
+        self._pushed = max(self._pushed - 1, 0)
         return np.concatenate([action[:6] + units * ([POSITION_STEP] * 3 + [ANGLE_STEP] * 3), gripper])

@@ -51,6 +51,11 @@ class Waypoint:
     hold: int = 0
     keep: Callable[[], bool] | None = None
 
+    @property
+    def careful(self) -> bool:
+        """Whether the hand reaches for something, touches it, or closes and opens around it."""
+        return self.slow < 1 or self.hold > 0
+
 
 @dataclass(frozen=True)
 class Style:
@@ -60,7 +65,6 @@ class Style:
         speed: Fraction of the top speed, 0.0095 m per control step and 0.024 rad.
         cruise: Height (m) of the TCP on its way over the table.
         yaw: Deviation (rad) of the hand's yaw where any will do.
-        side: -1 or 1, the side that is preferred where both do.
         idle_gripper: Open or closed on the way to what needs no particular one.
         pauses: Probability of waiting up to 8 steps at a waypoint.
         spread: 0 to 1, how far contact points and approach heights scatter.
@@ -69,7 +73,6 @@ class Style:
     speed: float = 0.9
     cruise: float = 0.58
     yaw: float = 0.0
-    side: float = 1.0
     idle_gripper: float = CLOSED
     pauses: float = 0.0
     spread: float = 0.0
@@ -81,7 +84,6 @@ class Style:
             speed=0.9 + variety * rng.uniform(-0.25, 0.1),
             cruise=0.58 + variety * rng.uniform(-0.01, 0.06),
             yaw=variety * rng.uniform(-0.2, 0.2),
-            side=1.0 if rng.uniform() < 1 - 0.5 * variety else -1.0,
             idle_gripper=CLOSED if rng.uniform() < 1 - 0.5 * variety else OPEN,
             pauses=0.08 * variety,
             spread=variety,

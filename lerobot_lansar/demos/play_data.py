@@ -74,10 +74,8 @@ def _play(
             task = _choose(tasks, before, rng)
             unit.tried[task] = unit.tried.get(task, 0) + 1
             skill, oracle, before = SKILLS[task], TASKS[task], task
-        elif _held(last) is not None:
-            task, skill, oracle = "", put_down, _never
         else:
-            return  # nothing can be done any more: a block fell off, or all are out of reach
+            task, skill, oracle = "", put_down, _never
         start, done = last, False
         rest = int(rng.integers(2, 20))
         for moves, limit, stop in ((skill, MAX_STEPS, oracle), (_resting, rest, _never)):
@@ -142,9 +140,9 @@ def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[s
     on_table = [c for c in COLORS if _free_on_table(view, snapshot, c)]
     slide, drawer = snapshot.slide, snapshot.drawer
     at_end = min(slide, scene.slide_travel - slide) < 0.03
-    if held is not None or any(block.bodies & {"robot"} for block in snapshot.blocks.values()):
-        if held is None or not view.holds(held):
-            return []
+    if held is not None:
+        if not view.holds(held):
+            return []  # it hangs on the hand somehow
         others = [c for c in on_table if c != held]
         return [
             *(["place_in_slider"] if at_end else []),

@@ -1,21 +1,23 @@
 """``lansar-record``: scripted demonstrations on the desk, in CALVIN's own on-disk format."""
 
 import contextlib
-import fcntl
+import importlib.util
 import json
-import os
+import shlex
 import shutil
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import draccus
 import numpy as np
+from filelock import FileLock, Timeout
 
-from ..desk import CONTROL_HZ, Desk, DeskError, SimulationError
+from ..desk import CONTROL_HZ, SCENES, Desk, DeskError, SimulationError
 from ..desk.commands import load_commands
 from ..executors import EXECUTORS, SlurmConfig, WorkerDied, run_shards
 from .calvin_folder import FrameWriter, Unit, group_by_scene, publish_split
@@ -26,7 +28,8 @@ from .skills import SKILLS
 ATTEMPTS = 20
 SPLITS = ("training", "validation")
 STAGING = ".recording"
-SLURM_LOGS = "slurm"
+SUBMITTED, PUBLISHING = "submitted", "publishing"  # marks in the staging folder
+SLURM_LOGS = ".recording-slurm"
 """Where Slurm's jobs keep their logs; they outlive the staging folder."""
 
 
@@ -41,7 +44,8 @@ class RecordConfig:
     mode: str = "windows"
     # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
     tasks: list[str] = field(default_factory=lambda: list(SKILLS))
-    # Accepted demonstrations in the training split, and in the validation split (a tenth by default). Windows only.
+    # Accepted demonstrations in the training split, and in the validation split (a tenth by default, and at least one
+    # of each task). Windows only.
     episodes: int = 100
     validation_episodes: int | None = None
     # Hours of play in the training split, and in the validation split (a tenth by default). Play only.
@@ -70,7 +74,7 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         if self.validation_episodes is None:
-            self.validation_episodes = max(1, round(self.episodes / 10))
+            self.validation_episodes = max(len(set(self.tasks)), round(self.episodes / 10))
         if self.validation_hours is None:
             self.validation_hours = self.hours / 10
 
@@ -81,24 +85,31 @@ class RecordConfig:
                 raise DeskError(f"--tasks: there is no task {task!r}; choose among: {', '.join(SKILLS)}")
         if not self.tasks:
             raise DeskError("--tasks must name at least one task")
+        for scene in self.scenes:
+            if scene not in SCENES:
+                raise DeskError(f"--scene: {scene!r} is none of {', '.join(SCENES)}")
         if not self.scenes or len(set(self.scenes)) != len(self.scenes):
             raise DeskError(f"--scene must name one scene, or different ones as '[A,B]', got {self.scene}")
         if self.mode not in ("windows", "play"):
             raise DeskError(f"--mode is windows or play, got {self.mode!r}")
         if self.executor not in EXECUTORS:
             raise DeskError(f"--executor is one of {', '.join(EXECUTORS)}, got {self.executor!r}")
-        if self.executor == "slurm" and shutil.which("sbatch") is None:
-            raise DeskError("--executor=slurm needs Slurm's sbatch on the PATH")
+        if self.executor == "slurm" and (shutil.which("sbatch") is None or not self.slurm.partition):
+            raise DeskError("--executor=slurm needs Slurm's sbatch on the PATH, and --slurm.partition=NAME")
+        if self.executor == "ray" and importlib.util.find_spec("ray") is None:
+            raise DeskError("--executor=ray needs Ray: pip install 'lerobot_policy_lansar[ray]'")
         if not 0 <= self.variety <= 1:
             raise DeskError(f"--variety lies between 0 and 1, got {self.variety}")
-        if not 0 <= self.noise <= 1:
-            raise DeskError(f"--noise lies between 0 and 1, got {self.noise}")
+        if not 0 <= self.noise <= 0.5:
+            raise DeskError(f"--noise lies between 0 and 0.5, got {self.noise}")
+        if self.seed < 0:
+            raise DeskError(f"--seed must be 0 or more, got {self.seed}")
         for name in ("episodes", "validation_episodes", "workers"):
             if getattr(self, name) < 1:
                 raise DeskError(f"--{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("hours", "validation_hours", "session_minutes"):
-            if not getattr(self, name) > 0:
-                raise DeskError(f"--{name} must be more than 0, got {getattr(self, name)}")
+        for name, minutes in (("hours", 60), ("validation_hours", 60), ("session_minutes", 1)):
+            if not 0.1 <= getattr(self, name) * minutes <= 1e6:
+                raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
 
     @property
     def scenes(self) -> list[str]:
@@ -120,38 +131,48 @@ class RecordConfig:
         if self.mode == "windows":
             assert self.validation_episodes is not None
             return self.episodes, self.validation_episodes
-        assert self.validation_hours is not None
-        training, validation = (
-            max(1, round(hours * 60 / self.session_minutes)) for hours in (self.hours, self.validation_hours)
-        )
+        training, validation = (len(self.session_frames(split)) for split in SPLITS)
         return training, validation
+
+    def session_frames(self, split: str) -> list[int]:
+        """The length of each session of play: the last one is what remains."""
+        hours = self.hours if split == "training" else self.validation_hours
+        assert hours is not None
+        left, each = (round(minutes * 60 * CONTROL_HZ) for minutes in (hours * 60, self.session_minutes))
+        return [min(each, left - start) for start in range(0, left, each)]
 
     def shard_size(self) -> int:
         """Units that one shard of work records; it depends on the request alone."""
-        return 1 if self.mode == "play" else max(8, sum(self.counts()) // 500)
+        return 1 if self.mode == "play" else max(4, sum(self.counts()) // 500)
 
 
 def record(config: RecordConfig) -> Path:
     """Records what ``config`` asks for; an interrupted recording goes on where it stopped.
 
-    Unit k (an episode, or a session of play) depends on (seed, k) alone, so the data are the same for any number of
-    workers. Finished units wait in OUTPUT_DIR/.recording; the splits appear at the end, each in one rename.
+    Unit k of a split (an episode, or a session of play) depends on the request, split and k alone, so the data are the
+    same for any number of workers. Finished units wait in OUTPUT_DIR/.recording; the splits appear at the end, each in
+    one rename.
 
     Raises:
-        DeskError: The folder holds a finished recording, or one that was begun with other options.
+        DeskError: The folder holds a finished recording, or one that was begun with other options or is being made.
         WorkerDied: A worker was killed.
     """
     config.check()
+    config = _with_absolute_paths(config)
     kinds = {_look(config, scene) for scene in config.scenes}
-    for split in SPLITS:
-        load_commands(_annotations(config, split), split)
+    for split, option in zip(SPLITS, ("annotations", "validation_annotations"), strict=True):
+        try:
+            load_commands(_annotations(config, split), split)
+        except DeskError as error:
+            raise DeskError(f"--{option}: {error}") from error
     output, staging = config.output_dir, config.output_dir / STAGING
-    if all((output / split).exists() for split in SPLITS):
-        shutil.rmtree(staging, ignore_errors=True)  # a run may have ended while it tidied up
-        raise DeskError(f"{output} already holds a recording; give another --output_dir or delete it first")
-    staging.mkdir(parents=True, exist_ok=True)
-    with _locked(staging) if config.executor == "local" else contextlib.nullcontext():
+    _check_target(output)
+    output.mkdir(parents=True, exist_ok=True)
+    with _locked(output):
+        _check_target(output)  # another process may have finished meanwhile
         _claim(staging, config)
+        if config.executor == "slurm":
+            (staging / SUBMITTED).touch()
         total = sum(config.counts())
         done = run_shards(
             (record_shard, (config,)),
@@ -170,6 +191,33 @@ def record(config: RecordConfig) -> Path:
     return output
 
 
+def _with_absolute_paths(config: RecordConfig) -> RecordConfig:
+    """Jobs may run in another working directory."""
+    paths = {
+        name: str(Path(value).resolve())
+        for name in ("assets", "annotations", "validation_annotations")
+        if (value := getattr(config, name)) is not None
+    }
+    return replace(config, output_dir=config.output_dir.resolve(), **paths)  # type: ignore[arg-type]
+
+
+def _check_target(output: Path) -> None:
+    """Raises DeskError when there is something that must not be replaced, or jobs are still on their way."""
+    staging = output / STAGING
+    found = [split for split in SPLITS if (output / split).exists()]
+    if len(found) == len(SPLITS):
+        shutil.rmtree(staging, ignore_errors=True)  # a run may have ended while it tidied up
+    if found and not (staging / PUBLISHING).exists():
+        raise DeskError(
+            f"{output} already holds a recording ({', '.join(found)}); give another --output_dir or delete it first"
+        )
+    if (staging / SUBMITTED).exists():
+        raise DeskError(
+            f"Slurm jobs for {output} were submitted already; wait for them, or cancel them and delete "
+            f"{staging / SUBMITTED} to submit what is missing"
+        )
+
+
 def record_shard(config: RecordConfig, shard: int) -> None:
     """Records those units of one shard that are not there yet."""
     size, total = config.shard_size(), sum(config.counts())
@@ -180,44 +228,49 @@ def record_shard(config: RecordConfig, shard: int) -> None:
 
 def record_unit(config: RecordConfig, index: int) -> None:
     """Records one episode (the first accepted one of its attempts) or one session of play."""
-    scene = unit_scene(config, index)
+    split, number, scene = place_of_unit(config, index)
+    seed = [config.seed, SPLITS.index(split), number]
     desk = _desk(scene, config.assets, tuple(config.cameras), config.renderer)
     with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene) as writer:
         if config.mode == "play":
-            frames = round(config.session_minutes * 60 * CONTROL_HZ)
-            rng = np.random.default_rng([config.seed, index])
+            frames = config.session_frames(split)[number]
+            rng = np.random.default_rng(seed)
             unit = record_play(desk, frames, rng, writer, config.noise, config.variety)
         else:
-            demonstration, tried = _attempt(config, desk, index)
-            for t in range(len(demonstration)):
+            task = config.tasks[number % len(config.tasks)]
+            demonstration, tried = _attempt(config, desk, task, seed)
+            n = len(demonstration)
+            for t in range(n):
                 writer.add({key: values[t] for key, values in demonstration.frames.items()})
-            task, n = demonstration.task, len(demonstration)
             unit = Unit(scene, n, [(0, n)], [(0, n, task)], {task: tried}, {task: 1}, writer.sums())
     unit.save(_note(config, index))
 
 
-def _attempt(config: RecordConfig, desk: Desk, index: int) -> tuple[Demonstration, int]:
-    task = config.tasks[index % len(config.tasks)]
+def place_of_unit(config: RecordConfig, index: int) -> tuple[str, int, str]:
+    """Split, number within it and scene of a unit; in each split the units of a scene follow each other."""
+    training, validation = config.counts()
+    if index < training:
+        return "training", index, group_by_scene(config.scenes, training)[index]
+    number = index - training
+    return "validation", number, group_by_scene(config.scenes, validation)[number]
+
+
+def _attempt(config: RecordConfig, desk: Desk, task: str, seed: list[int]) -> tuple[Demonstration, int]:
     for attempt in range(ATTEMPTS):
-        rng = np.random.default_rng([config.seed, index, attempt])
+        rng = np.random.default_rng([*seed, attempt])
         try:
             demonstration = demonstrate(desk, task, rng, config.noise, config.variety)
         except SimulationError:
             continue
         if demonstration is not None:
             return demonstration, attempt + 1
-    raise DeskError(f"{task} failed {ATTEMPTS} times in a row (seed {config.seed}, episode {index})")
+    raise DeskError(
+        f"{task} failed {ATTEMPTS} times in a row in scene {desk.scene.name} (seed {seed}); try less "
+        "--noise or another --seed"
+    )
 
 
-def unit_scene(config: RecordConfig, index: int) -> str:
-    """In which scene a unit is recorded: in each split the units of a scene follow each other."""
-    training, validation = config.counts()
-    if index < training:
-        return group_by_scene(config.scenes, training)[index]
-    return group_by_scene(config.scenes, validation)[index - training]
-
-
-@lru_cache(maxsize=4)
+@cache
 def _desk(scene: str, assets: str | None, cameras: tuple[str, ...], renderer: str) -> Desk:
     """This process's desks: loading one takes as long as some episodes."""
     return Desk(scene, assets, cameras, renderer)
@@ -227,7 +280,7 @@ def _note(config: RecordConfig, index: int) -> Path:
     return config.output_dir / STAGING / f"{index:06d}.json"
 
 
-def publish(config: RecordConfig, kind: str, _: int = 0) -> None:
+def publish(config: RecordConfig, kind: str, _: int) -> None:
     """Builds both splits from the recorded units, prints the summary and removes the staging folder."""
     output, staging = config.output_dir, config.output_dir / STAGING
     details = {**config.request(), "assets_used": kind, "control_hz": CONTROL_HZ}
@@ -236,6 +289,7 @@ def publish(config: RecordConfig, kind: str, _: int = 0) -> None:
     }
     training, validation = config.counts()
     units = [Unit.load(_note(config, index)) for index in range(training + validation)]
+    (staging / PUBLISHING).touch()
     frame = 0
     for split, indices in (
         ("training", range(training)),
@@ -285,16 +339,15 @@ def summary(config: RecordConfig, units: list[Unit]) -> str:
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Keeps a second process out of ``folder``; the lock ends with its process, however it ends."""
-    lock = os.open(folder, os.O_RDONLY)
+def _locked(output: Path) -> Iterator[None]:
+    """Keeps a second process out of ``output``; the lock ends with its process, however it ends."""
+    file = output / ".recording.lock"
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError:
-        raise DeskError(f"another process is recording into {folder.parent}") from None
-    finally:
-        os.close(lock)
+        with FileLock(file, timeout=0):
+            yield
+            file.unlink(missing_ok=True)
+    except Timeout:
+        raise DeskError(f"another process is recording into {output}") from None
 
 
 def _look(config: RecordConfig, scene: str) -> str:
@@ -305,17 +358,19 @@ def _look(config: RecordConfig, scene: str) -> str:
 
 def _claim(staging: Path, config: RecordConfig) -> None:
     """Makes the staging folder ours, or goes on with one that was begun with the same options."""
+    staging.mkdir(exist_ok=True)
     file = staging / "request.json"
     request = json.loads(json.dumps(config.request()))
-    if file.exists():
-        if json.loads(file.read_text()) != request:
-            raise DeskError(
-                f"{staging} holds a recording that was begun with other options; delete it, or repeat the options of "
-                f"{file}"
-            )
+    if file.exists() and json.loads(file.read_text()) == request:
+        for leftover in staging.glob("*.partial"):  # of processes that were killed
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         return
+    if file.exists() and any(staging.glob("[0-9]*.json")):
+        raise DeskError(
+            f"{staging} holds a recording that was begun with other options; delete it, or repeat the options of {file}"
+        )
     shutil.rmtree(staging.parent / SLURM_LOGS, ignore_errors=True)  # it remembers shards of another recording
-    for leftover in staging.iterdir():  # without its request nothing tells what these episodes are
+    for leftover in staging.iterdir():  # without its request nothing tells what these units are
         shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
     partial = file.with_suffix(".partial")
     partial.write_text(json.dumps(request, indent=1))
@@ -328,6 +383,11 @@ def main() -> None:
         record(draccus.parse(RecordConfig))
     except (DeskError, WorkerDied, OSError, draccus.utils.ParsingError) as error:
         print(f"lansar-record: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except subprocess.CalledProcessError as error:
+        print(
+            f"lansar-record: error: {shlex.join(error.cmd)} failed: {error.stderr or error}", file=sys.stderr
+        )
         sys.exit(2)
     except KeyboardInterrupt:
         print("lansar-record: interrupted; the same command goes on where it stopped", file=sys.stderr)

@@ -255,7 +255,7 @@ def load_commands(file: str | Path | None, split: str) -> dict[str, list[str]]:
         raise DeskError(f"annotations file {path} does not exist")
     try:
         content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DeskError(f"annotations file {path} is not YAML: {error}") from error
     if not isinstance(content, dict):
         raise DeskError(

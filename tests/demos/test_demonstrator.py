@@ -6,10 +6,11 @@ import os
 import numpy as np
 import pytest
 
-from lerobot_lansar.demos.demonstrator import MAX_STEPS, demonstrate
+from lerobot_lansar.demos.demonstrator import MAX_STEPS, carry_out, demonstrate
 from lerobot_lansar.demos.motion import TOP_SPEED, relative_action
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, TASKS, Desk, DeskError, SimulationError
+from lerobot_lansar.desk.starts import sample_start
 
 STARTS = 30
 
@@ -60,6 +61,7 @@ def demonstrations():
     """Two of each task in scene D."""
     with Desk("D", cameras=()) as desk:
         found = [demonstrate(desk, task, np.random.default_rng([4, k])) for task in TASKS for k in range(2)]
+    assert sum(d is not None for d in found) >= 0.9 * len(found)
     return [d for d in found if d is not None]
 
 
@@ -131,8 +133,27 @@ def test_variety_changes_the_way_and_none_of_it_repeats_it():
         with Desk("D", cameras=()) as desk:
             return demonstrate(desk, "turn_on_led", np.random.default_rng(seed), 0.0, variety)
 
-    lengths = {len(way(seed, 1.0)) for seed in range(5)}
-    assert len(lengths) > 2
+    def differences(variety):
+        """Of where the hand is pressing the button, with the same start: only the style's seed differs."""
+        with Desk("D", cameras=()) as desk:
+            start = sample_start(desk, "turn_on_led", np.random.default_rng(0))
+            ways = []
+            for seed in range(4):
+                obs = desk.reset(*start)
+                steps = carry_out(
+                    desk,
+                    obs,
+                    SKILLS["turn_on_led"],
+                    np.random.default_rng(seed),
+                    variety=variety,
+                    noise=0.0,
+                    steps=40,
+                )
+                ways.append(np.array([after["robot_obs"][:3] for _, after, _ in steps]))
+        return np.ptp(ways, axis=0).max()
+
+    assert differences(0.0) == 0
+    assert differences(1.0) > 0.01
     one, same = way(2, 1.0), way(2, 1.0)
     assert all(np.array_equal(one.frames[key], same.frames[key]) for key in one.frames)
 
@@ -145,4 +166,4 @@ def test_noise_moves_the_hand_but_not_what_is_recorded():
     strays = np.linalg.norm(reached - asked, axis=1)
     assert strays.max() > 0.004
     steady = np.abs(np.diff(frames["rel_actions"][:, :3], axis=0))
-    assert np.median(steady) < 0.2
+    assert np.median(steady) < 0.1  # 0.19 if what is executed were recorded

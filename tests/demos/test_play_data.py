@@ -7,7 +7,7 @@ from lerobot_lansar.demos.calvin_folder import group_by_scene
 from lerobot_lansar.demos.motion import relative_action
 from lerobot_lansar.demos.play_data import WINDOW, cut_windows, feasible_tasks
 from lerobot_lansar.demos.record import RecordConfig, record
-from lerobot_lansar.desk import CONTROL_HZ, TASKS, Desk
+from lerobot_lansar.desk import CONTROL_HZ, TASKS, Desk, completed_tasks
 from lerobot_lansar.desk.starts import sample_start
 
 
@@ -49,7 +49,9 @@ def test_nothing_jumps_within_a_recording(play):
     for first, last in load(folder, "ep_start_end_ids.npy"):
         rows = [np.load(folder / f"episode_{k:07d}.npz") for k in range(first, last + 1)]
         robot = np.array([row["robot_obs"] for row in rows])
-        assert np.abs(np.diff(robot[:, :3], axis=0)).max() < 0.05
+        assert np.abs(np.diff(robot[:, :3], axis=0)).max() < 0.035  # a push in the hand's own direction
+        blocks = np.array([row["scene_obs"][6:] for row in rows])[:, [0, 1, 2, 6, 7, 8, 12, 13, 14]]
+        assert np.abs(np.diff(blocks, axis=0)).max() < 0.1  # m per control step: what falls is not faster
         for row in rows[::50]:
             np.testing.assert_allclose(row["rel_actions"], relative_action(row["actions"], row["robot_obs"]))
 
@@ -76,7 +78,7 @@ def test_windows_hold_one_fulfilled_task_each(play):
             frame = np.load(folder / f"episode_{number:07d}.npz")
             desk.reset(frame["robot_obs"], frame["scene_obs"])
             snapshots.append(desk.snapshot())
-        agreed += TASKS[task](*snapshots)
+        agreed += completed_tasks(*snapshots) == {task}
     for desk in desks.values():
         desk.close()
     # a reset knows no velocities and no contact forces: what is just being let go may differ

@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 
+import lerobot_lansar.demos.record as record_module
 from lerobot_lansar.demos.motion import relative_action
 from lerobot_lansar.demos.record import RecordConfig, record
 from lerobot_lansar.desk import SCENES, DeskError
@@ -151,7 +152,7 @@ def test_a_killed_worker_ends_the_run_and_the_next_one_goes_on(recording, tmp_pa
     while not list((target / ".recording").glob("0*-*.partial")) and time.time() < deadline:
         time.sleep(0.01)
     (partial,) = list((target / ".recording").glob("0*-*.partial"))[:1]
-    os.kill(int(partial.stem.split("-")[1]), signal.SIGKILL)
+    os.kill(int(partial.stem.split("-")[-1]), signal.SIGKILL)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "a worker process was killed" in errors
@@ -172,6 +173,56 @@ def test_splits_speak_different_sentences(recording):
     assert {task: entry["ann"] for task, entry in benchmark.items()} == {
         task: sentences[:1] for task, sentences in COMMANDS["validation"].items()
     }
+
+
+def test_a_split_that_is_there_already_is_never_replaced(tmp_path):
+    mine = tmp_path / "desk" / "training"
+    mine.mkdir(parents=True)
+    (mine / "precious").touch()
+    with pytest.raises(DeskError, match=r"already holds a recording \(training\)"):
+        record(options(tmp_path / "desk"))
+    assert (mine / "precious").exists()
+
+
+def test_a_publication_that_was_cut_short_is_repeated(recording, tmp_path, monkeypatch):
+    target = tmp_path / "desk"
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="disk full"):
+        publish = record_module.publish_split
+
+        def fails_in_the_middle(folder, *arguments):
+            if folder.name == "validation":
+                raise OSError("disk full")
+            return publish(folder, *arguments)
+
+        patch.setattr(record_module, "publish_split", fails_in_the_middle)
+        record(options(target))
+    assert not (target / "validation").exists()
+    record(options(target))
+    for split in ("training", "validation"):
+        assert same(frames(target / split), frames(recording / split))
+    assert sorted(file.name for file in target.iterdir()) == ["training", "validation"]
+
+
+def test_a_mistaken_request_can_be_corrected_before_anything_was_recorded(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no"):
+        patch.setattr(record_module, "run_shards", lambda *_, **__: (_ for _ in ()).throw(OSError("no")))
+        record(options(tmp_path / "desk", seed=8))
+    record(options(tmp_path / "desk", seed=9, episodes=1, validation_episodes=1))
+
+
+def test_validation_is_not_a_part_of_a_longer_training(tmp_path):
+    short = record(options(tmp_path / "short", tasks=["turn_on_led"], episodes=1, validation_episodes=1))
+    long = record(options(tmp_path / "long", tasks=["turn_on_led"], episodes=2, validation_episodes=1))
+    (held_out,) = starts(short / "validation")
+    assert not any(np.array_equal(held_out, start) for start in starts(long / "training"))
+    assert np.array_equal(starts(short / "training")[0], starts(long / "training")[0])
+    assert np.array_equal(starts(short / "validation")[0], starts(long / "validation")[0])
+
+
+def starts(folder):
+    """The first robot_obs of each recording."""
+    bounds = np.load(folder / "ep_start_end_ids.npy")
+    return [np.load(folder / f"episode_{first:07d}.npz")["robot_obs"] for first, _ in bounds]
 
 
 def test_users_sentences_are_used(tmp_path):
@@ -215,10 +266,14 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
         ({"mode": "work"}, "--mode is windows or play"),
         ({"executor": "pigeon"}, "--executor is one of local, slurm, ray"),
         ({"variety": 2.0}, "--variety lies between 0 and 1"),
-        ({"noise": -0.1}, "--noise lies between 0 and 1"),
-        ({"mode": "play", "hours": 0.0}, "--hours must be more than 0"),
-        ({"annotations": "nowhere.yaml"}, "annotations file nowhere.yaml does not exist"),
-        ({"scene": "E"}, "scene 'E' is unknown"),
+        ({"noise": -0.1}, "--noise lies between 0 and 0.5"),
+        ({"mode": "play", "hours": 0.0}, "--hours must be at least 6 seconds"),
+        ({"mode": "play", "session_minutes": float("inf")}, "--session_minutes must be at least"),
+        ({"annotations": "nowhere.yaml"}, "--annotations: annotations file .*nowhere.yaml does not exist"),
+        ({"validation_annotations": "nowhere.yaml"}, "--validation_annotations: annotations file"),
+        ({"seed": -1}, "--seed must be 0 or more"),
+        ({"scene": "D_eval"}, "--scene: 'D_eval' is none of A, B, C, D"),
+        ({"scene": "E"}, "--scene: 'E' is none of A, B, C, D"),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"cameras": ["wrist"]}, "camera 'wrist'"),
         ({"assets": "nowhere"}, "is missing"),

@@ -100,9 +100,7 @@ def _take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     yaw = yaws[0] + view.scatter(0.08)
     position, euler = _hold(view, color, yaw)
     lead = 0.2 if in_cabinet(position) else 0.08 + abs(view.scatter(0.03))
-    gripper = OPEN if view.rng.uniform() < 0.7 else view.style.idle_gripper
-    if view.held() is not None:
-        gripper = OPEN
+    gripper = OPEN if view.held() else view.style.idle_gripper
     yield from travel(view, position - lead * approach(euler), gripper, euler)
     yield view.go(position - 0.8 * lead * approach(euler), OPEN, euler, tolerance=0.012)
     position, euler = _hold(view, color, yaw)
@@ -448,8 +446,10 @@ def _nearest_to_drawer(view: View) -> str | None:
 
 
 def put_down(view: View) -> Iterator[Waypoint]:
-    """Set the block in the hand down on the table; no task of its own."""
+    """Set the block in the hand down on the table, or open the hand; no task of its own."""
     color = view.held()
-    if color is not None:
+    if color is None:
+        yield view.go(view.tcp.copy(), OPEN, view.robot_obs[3:6].copy(), hold=5)
+    else:
         place = np.array([*_landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
         yield from _from_above(view, color, place, turned(view.robot_obs[5]), 0.55)
