@@ -89,7 +89,9 @@ def test_replayed_actions_fulfil_the_task_again(demonstrations):
             start = desk.snapshot()
             for action in frames["actions"]:
                 desk.step(action, "abs")
-            again += TASKS[demonstration.task](start, desk.snapshot())
+                if TASKS[demonstration.task](start, desk.snapshot()):
+                    again += 1
+                    break
     assert again >= 0.95 * len(demonstrations)
 
 
