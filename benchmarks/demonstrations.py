@@ -3,9 +3,11 @@
     python benchmarks/demonstrations.py [--starts=200] [--scenes='[A,B,C,D]'] [--assets=DIR] [--workers=2] \
         [--output=FILE.json]
 
-Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. What is in FILE is not done again.
+Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. What is in FILE from the same code and
+options is not done again.
 """
 
+import hashlib
 import json
 import multiprocessing
 from dataclasses import dataclass, field
@@ -16,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_lansar.demos.demonstrator import demonstrate
+import lerobot_lansar
 from lerobot_lansar.desk import TASKS, Desk, SimulationError
 
 SEED = 1_000_000
@@ -47,24 +50,35 @@ def measure(job: tuple[str, str, str | None, int]) -> tuple[str, str, list[int]]
     return scene, task, lengths
 
 
+def code_and_options(options: Options) -> str:
+    """A hash of everything that decides the results."""
+    package = Path(lerobot_lansar.__file__).parent
+    digest = hashlib.sha256(f"{options.starts} {options.assets}".encode())
+    for file in sorted((*package.glob("desk/*.py"), *package.glob("demos/**/*.py"))):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
 def main() -> None:
     """Measures what is missing and prints the table."""
     options = draccus.parse(Options)
+    state = code_and_options(options)
     known: dict[str, list[int]] = {}
     if options.output is not None and options.output.exists():
-        known = json.loads(options.output.read_text())
+        stored = json.loads(options.output.read_text())
+        known = stored["lengths"] if stored["state"] == state else {}
     jobs = [
         (scene, task, options.assets, options.starts)
         for task in TASKS
         for scene in options.scenes
-        if len(known.get(f"{scene} {task}", ())) != options.starts
+        if f"{scene} {task}" not in known
     ]
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         for scene, task, lengths in tqdm(pool.imap_unordered(measure, jobs), total=len(jobs), unit="task"):
             known[f"{scene} {task}"] = lengths
             if options.output is not None:
                 options.output.parent.mkdir(parents=True, exist_ok=True)
-                options.output.write_text(json.dumps(known))
+                options.output.write_text(json.dumps({"state": state, "lengths": known}))
     print("| task | " + " | ".join(f"{scene} (%)" for scene in options.scenes) + " | mean frames |")
     print("| --- |" + " ---: |" * (len(options.scenes) + 1))
     for task in TASKS:
