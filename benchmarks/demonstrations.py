@@ -17,8 +17,8 @@ import draccus
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_lansar.demos.demonstrator import demonstrate
 import lerobot_lansar
+from lerobot_lansar.demos.demonstrator import demonstrate
 from lerobot_lansar.desk import TASKS, Desk, SimulationError
 
 SEED = 1_000_000

@@ -186,16 +186,17 @@ def test_a_split_that_is_there_already_is_never_replaced(tmp_path):
 
 def test_a_publication_that_was_cut_short_is_repeated(recording, tmp_path, monkeypatch):
     target = tmp_path / "desk"
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="disk full"):
-        publish = record_module.publish_split
+    publish = record_module.publish_split
 
-        def fails_in_the_middle(folder, *arguments):
-            if folder.name == "validation":
-                raise OSError("disk full")
-            return publish(folder, *arguments)
+    def fails_in_the_middle(folder, *arguments):
+        if folder.name == "validation":
+            raise OSError("disk full")
+        return publish(folder, *arguments)
 
+    with monkeypatch.context() as patch:
         patch.setattr(record_module, "publish_split", fails_in_the_middle)
-        record(options(target))
+        with pytest.raises(OSError, match="disk full"):
+            record(options(target))
     assert not (target / "validation").exists()
     record(options(target))
     for split in ("training", "validation"):
@@ -204,9 +205,13 @@ def test_a_publication_that_was_cut_short_is_repeated(recording, tmp_path, monke
 
 
 def test_a_mistaken_request_can_be_corrected_before_anything_was_recorded(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="no"):
-        patch.setattr(record_module, "run_shards", lambda *_, **__: (_ for _ in ()).throw(OSError("no")))
-        record(options(tmp_path / "desk", seed=8))
+    def fails(*_, **__):
+        raise OSError("no")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(record_module, "run_shards", fails)
+        with pytest.raises(OSError, match="no"):
+            record(options(tmp_path / "desk", seed=8))
     record(options(tmp_path / "desk", seed=9, episodes=1, validation_episodes=1))
 
 
