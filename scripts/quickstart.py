@@ -80,6 +80,7 @@ def record_and_convert() -> None:
             "--validation_episodes=55",
             "--cameras=[]",
             f"--annotations={COMMANDS}",
+            "--variety=0.3",
             "--seed=0",
             "--workers=2",
             f"--output_dir={DATA}",
