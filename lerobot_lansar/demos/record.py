@@ -54,7 +54,7 @@ class RecordConfig:
     # Play is recorded in sessions of so many minutes; sessions are what workers share.
     session_minutes: float = 2.0
     seed: int = 0
-    # Pictures to record: static, gripper; '[]' records states only, many times faster.
+    # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
     cameras: list[str] = field(default_factory=lambda: ["static", "gripper"])
     # Disturbance of executed actions, in relative action units (recorded are the intended ones).
     noise: float = 0.2

@@ -95,8 +95,6 @@ def _take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
         yield from _draw_in(view, color)
     yaws = grasp_yaws(view, color)
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw + turn <= YAWS[1]] or yaws
-    if not yaws:
-        return
     yaw = yaws[0] + view.scatter(0.08)
     position, euler = _hold(view, color, yaw)
     lead = 0.2 if in_cabinet(position) else 0.08 + abs(view.scatter(0.03))
