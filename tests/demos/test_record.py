@@ -90,18 +90,28 @@ def test_blocks_go_to_disk_in_the_scenes_original_order(tmp_path):
     assert np.argmax(heights[-1] - heights[0]) == list(SCENES["A"].blocks).index("red") == 2
 
 
+def start(target, **popen):
+    """The command of ``options(target)``, with two workers, in a process of its own."""
+    flags = ["--seed=3", "--cameras=[]", "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4"]
+    flags += ["--validation_episodes=2", "--workers=2", f"--output_dir={target}"]
+    command = [sys.executable, "-m", "lerobot_lansar.demos.record", *flags]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, text=True, **popen)
+
+
+def first_file(folder, pattern, seconds=120):
+    """The first file of that pattern, as soon as there is one."""
+    deadline = time.time() + seconds
+    while time.time() < deadline:
+        for file in folder.glob(pattern):
+            return file
+        time.sleep(0.005)
+    raise TimeoutError(f"no {pattern} in {folder} within {seconds} s")
+
+
 def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
     target = tmp_path / "desk"
-    command = [
-        sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", "--seed=3", "--cameras=[]",
-        "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4", "--validation_episodes=2", "--workers=2",
-    ]  # fmt: skip
-    process = subprocess.Popen(
-        command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
-    )
-    deadline = time.time() + 120
-    while not list((target / ".recording").glob("0*.json")) and time.time() < deadline:
-        time.sleep(0.01)
+    process = start(target, stderr=subprocess.DEVNULL, start_new_session=True)
+    first_file(target / ".recording", "0*.json")
     os.killpg(process.pid, signal.SIGSTOP)
     assert 1 <= len(list((target / ".recording").glob("0*.json"))) < 6
     with pytest.raises(DeskError, match="another process is recording"):
@@ -109,6 +119,7 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
     process.kill()
     process.wait()
     os.killpg(process.pid, signal.SIGCONT)
+    deadline = time.time() + 120
     while _alive(process.pid) and time.time() < deadline:  # the workers notice and end
         time.sleep(0.05)
     assert not _alive(process.pid)
@@ -143,15 +154,8 @@ def test_leftovers_of_an_unknown_recording_are_not_adopted(recording, tmp_path):
 
 def test_a_killed_worker_ends_the_run_and_the_next_one_goes_on(recording, tmp_path):
     target = tmp_path / "desk"
-    command = [
-        sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", "--seed=3", "--cameras=[]",
-        "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4", "--validation_episodes=2", "--workers=2",
-    ]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    deadline = time.time() + 120
-    while not list((target / ".recording").glob("0*-*.partial")) and time.time() < deadline:
-        time.sleep(0.01)
-    (partial,) = list((target / ".recording").glob("0*-*.partial"))[:1]
+    process = start(target, stderr=subprocess.PIPE)
+    partial = first_file(target / ".recording", "0*-*.partial")  # the worker's first of two or four
     os.kill(int(partial.stem.split("-")[-1]), signal.SIGKILL)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 2
