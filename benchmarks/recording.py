@@ -33,7 +33,7 @@ class Options:
 
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
-    # Episodes per measurement: two of each task.
+    # Episodes of the timed parts, two of each task; whole commands record six times as many.
     episodes: int = 68
     output: Path | None = None
 
@@ -90,7 +90,7 @@ def command(options: Options, cameras: list[str], workers: int) -> float:
         target = Path(folder) / "desk"
         words = [
             sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", f"--workers={workers}",
-            f"--episodes={2 * options.episodes}", "--validation_episodes=2", f"--cameras=[{','.join(cameras)}]",
+            f"--episodes={6 * options.episodes}", "--validation_episodes=2", f"--cameras=[{','.join(cameras)}]",
         ]  # fmt: skip
         if options.assets is not None:
             words.append(f"--assets={options.assets}")

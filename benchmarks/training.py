@@ -104,7 +104,7 @@ def measure(options: Options, root: Path) -> dict:
         end = time.perf_counter()
         waiting.append(ready - start)
         computing.append(end - ready)
-        steps.append(int((~batch["action_is_pad"]).sum()))
+        steps.append(len(batch["valid_steps"]))
     data, update = (sum(values[2:]) / options.updates for values in (waiting, computing))
     return {
         "preset": options.preset,

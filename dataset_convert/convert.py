@@ -186,7 +186,8 @@ def convert(config: ConvertConfig) -> Path:
             },
             "versions": {name: version(name) for name in ("lerobot_policy_lansar", "lerobot", "numpy", "av")},
             "episodes": [
-                {"start": w.start, "end": w.end, "task": w.task, "scene": w.scene} for w in split.windows
+                {"start": w.start, "end": w.end, "task": w.task, "sentence": w.sentence, "scene": w.scene}
+                for w in split.windows
             ],
         }
         (root / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")

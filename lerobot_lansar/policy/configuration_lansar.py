@@ -18,6 +18,7 @@ CHOICES = {
     "target": ("commanded", "achieved"),
     "window_start": ("episode", "anywhere", "mixed"),
     "control_mode": ("abs", "rel"),
+    "dtype": ("float32", "bfloat16"),
 }
 
 
@@ -51,12 +52,21 @@ class LanSARConfig(PreTrainedConfig):
             "achieved" = the next pose minus the current pose (thesis).
         window_start: which windows are trained on, see `windows.py`. "episode" = from the demonstration's
             start (thesis), "anywhere" = from the sampled frame, "mixed" = half of each.
+        paraphrases: in training a window's command is replaced by a random one among the dataset's sentences for
+            the same CALVIN task (meta/calvin_source.json says which task an episode shows).
+        state_noise: in training the robot state is disturbed by normal noise of so many standard deviations.
+        contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out.
+        ema_decay: the network that acts is a running average of the trained one with this decay; 0 = none.
+        dtype: "float32", or "bfloat16" for mixed-precision training on a GPU that has it.
         smooth_l1_beta: beta of Eq 4.3, 4.4.
         learning_rate, weight_decay, warmup_fraction: AdamW and its schedule (Table 4.2).
         control_mode: what `select_action` returns. "abs": target pose (m, rad); "rel": the difference to the
             pose in units of (0.02 m, 0.05 rad), clipped to +-1. Must be the env's own (`--env.control_mode`).
         history_clear_steps: the history is forgotten after this many steps (and whenever the command
             changes).
+        window_slide: once the window is full, its oldest steps are forgotten so many at a time. 1 as in the
+            thesis: every position changes at every step, so the whole window is decoded again. Half a window
+            decodes one step most of the time.
         position_scale_start, position_scale_slope: predicted position differences are multiplied by
             start - slope * history / window; the thesis has 3 and 1 (Eq 4.8).
         yaw_scale: predicted yaw differences are multiplied by this; 1.5 in the thesis (section 4.3.1).
@@ -81,6 +91,11 @@ class LanSARConfig(PreTrainedConfig):
     egocentric_blocks: bool = False
     target: str = "commanded"
     window_start: str = "mixed"
+    paraphrases: bool = False
+    state_noise: float = 0.0
+    contrastive_weight: float = 0.0
+    ema_decay: float = 0.0
+    dtype: str = "float32"
 
     smooth_l1_beta: float = 0.1
     learning_rate: float = 4e-4
@@ -89,6 +104,7 @@ class LanSARConfig(PreTrainedConfig):
 
     control_mode: str = "abs"
     history_clear_steps: int = 120
+    window_slide: int = 1
     position_scale_start: float = 1.0
     position_scale_slope: float = 0.0
     yaw_scale: float = 1.0
@@ -123,6 +139,15 @@ class LanSARConfig(PreTrainedConfig):
         for name in ("window", "context_layers", "decoder_layers", "history_clear_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--policy.{name}={getattr(self, name)} must be at least 1.")
+        for name in ("state_noise", "contrastive_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--policy.{name}={getattr(self, name)} must be 0 or more.")
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(f"--policy.ema_decay={self.ema_decay} must be at least 0 and below 1.")
+        if not 1 <= self.window_slide <= self.window:
+            raise ValueError(
+                f"--policy.window_slide={self.window_slide} must lie between 1 and --policy.window={self.window}."
+            )
         if not (self.use_images or self.use_spatial_context):
             raise ValueError(
                 "--policy.use_images=false and --policy.use_spatial_context=false together leave nothing "
@@ -151,6 +176,7 @@ class LanSARConfig(PreTrainedConfig):
             use_spatial_context=self.use_spatial_context,
             command_in_context=self.command_in_context,
             command_prepended=self.command_prepended,
+            contrastive=self.contrastive_weight > 0,
         )
 
     def validate_features(self) -> None:

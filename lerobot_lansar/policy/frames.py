@@ -179,3 +179,28 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
             "the hub with --dataset.episodes, download all of it."
         )
     return arrays, info
+
+
+def load_paraphrases(root: Path) -> dict[str, list[str]]:
+    """For each of the dataset's sentences, all of its sentences for the same CALVIN task, itself included.
+
+    Raises:
+        ValueError: the dataset does not say which task an episode shows.
+    """
+    file = Path(root) / "meta" / "calvin_source.json"
+    episodes = json.loads(file.read_text())["episodes"] if file.is_file() else [{}]
+    if any(not {"task", "sentence"} <= episode.keys() for episode in episodes):
+        raise ValueError(
+            f"--policy.paraphrases=true needs task and sentence of every episode in {file}, as lansar-convert "
+            "writes them: convert the dataset again, or train without (--policy.paraphrases=false)."
+        )
+    by_task: dict[str, set[str]] = {}
+    by_sentence: dict[str, set[str]] = {}
+    for episode in episodes:
+        by_task.setdefault(episode["task"], set()).add(episode["sentence"])
+        by_sentence.setdefault(episode["sentence"], set()).add(episode["task"])
+    # a sentence that names two tasks keeps to sentences that do so too
+    return {
+        sentence: sorted(set.intersection(*(by_task[task] for task in tasks)))
+        for sentence, tasks in by_sentence.items()
+    }

@@ -1,6 +1,7 @@
 """LanSAR for LeRobot: the loss in training; at inference one action per step, a history per environment."""
 
 import logging
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,11 +10,11 @@ import torch.nn.functional as F
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from .configuration_lansar import LanSARConfig
-from .network import LanSARNetwork
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE
+from .network import DecoderCache, LanSARNetwork
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, VALID_STEPS
 from .scaling import SCENE_DIM, STATE_DIM, Scaler, wrap
 from .windows import ORIENTATION_UNIT, POSITION_UNIT, Windows, set_current
 
@@ -39,6 +40,30 @@ class History:
     states: Tensor
 
 
+class LossParts(Mapping[str, float]):
+    """Loss terms that become numbers when they are read: reading them in `forward` would make a GPU wait."""
+
+    def __init__(self, terms: dict[str, Tensor]) -> None:
+        self._terms = {name: value.detach() for name, value in terms.items()}
+
+    def __getitem__(self, name: str) -> float:
+        return self._terms[name].item()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._terms)
+
+    def __len__(self) -> int:
+        return len(self._terms)
+
+
+def one_row_at_a_time(device: torch.device) -> bool:
+    """Whether environments are decided one by one. On a CPU batching gains little, and the size of a matrix
+    product changes its last bits: so results there are exactly the same for every batch size. On a GPU they are
+    up to rounding.
+    """
+    return device.type == "cpu"
+
+
 class LanSARPolicy(PreTrainedPolicy):
     """Language-commanded Scene-aware Action Response.
 
@@ -56,6 +81,7 @@ class LanSARPolicy(PreTrainedPolicy):
     config_class = LanSARConfig
     name = "lansar"
     config: LanSARConfig
+    _no_split_modules = ("EncoderLayer", "DecoderLayer")  # the units that FSDP shards
 
     def __init__(
         self, config: LanSARConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any
@@ -64,6 +90,10 @@ class LanSARPolicy(PreTrainedPolicy):
         config.validate_features()
         self.scaler = Scaler(config.orientation, config.egocentric_blocks)
         self.network = LanSARNetwork(config.network)
+        self.averaged: AveragedModel | None = None
+        if config.ema_decay:
+            average = get_ema_multi_avg_fn(config.ema_decay)
+            self.averaged = AveragedModel(self.network, multi_avg_fn=average).requires_grad_(False)
         if dataset_meta is not None:
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
                 logging.warning(
@@ -80,13 +110,23 @@ class LanSARPolicy(PreTrainedPolicy):
         self.reset()
 
     def get_optim_params(self) -> Any:
-        return self.parameters()
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def update(self) -> None:
+        """Take the new weights into their average; LeRobot calls this after every update."""
+        if self.averaged is not None:
+            self.averaged.update_parameters(self.network)
+
+    @property
+    def acting(self) -> LanSARNetwork:
+        """The network that acts: the averaged one, if there is one."""
+        return self.network if self.averaged is None else self.averaged.module
 
     def reset(self) -> None:
         """Forget every environment's history; LeRobot calls this when a batch of episodes begins."""
         self._histories: list[History] = []
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Mapping[str, float]]:
         """Loss of a batch of windows, averaged over their valid steps (Eq 4.3-4.6).
 
         Args:
@@ -95,21 +135,27 @@ class LanSARPolicy(PreTrainedPolicy):
         Returns:
             The scalar loss, and its parts.
         """
-        if "action_is_pad" not in batch or CLIP_COMMAND not in batch:
+        if VALID_STEPS not in batch or CLIP_COMMAND not in batch:
             raise ValueError("LanSAR's forward needs windows: pass the batch through its preprocessor first.")
-        valid = ~batch["action_is_pad"]
+        rows = batch[VALID_STEPS]
         state, blocks, scene = self.scaler.encode(batch[OBS_STATE], batch[OBS_ENV_STATE])
         static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
-        motion, logit = self.network(batch[CLIP_COMMAND], state, blocks, scene, valid, static, gripper)
-        goal = batch[ACTION][valid]  # (N, 7)
+        if self.training and self.config.state_noise:
+            state = state + self.config.state_noise * torch.randn_like(state)
+        network = self.network if self.training else self.acting
+        motion, logit, contrast = network(batch[CLIP_COMMAND], state, blocks, scene, rows, static, gripper)
+        goal = batch[ACTION].flatten(0, 1)[rows]  # (N, 7)
         delta = self.scaler.scale_delta(goal[:, :6])
         beta = self.config.smooth_l1_beta
         position = F.smooth_l1_loss(motion[:, :3], delta[:, :3], beta=beta)
         orientation = F.smooth_l1_loss(motion[:, 3:], delta[:, 3:], beta=beta)
         open_close = F.binary_cross_entropy_with_logits(logit, goal[:, 6])
-        loss = position + orientation + open_close
         parts = {"position_loss": position, "orientation_loss": orientation, "gripper_loss": open_close}
-        return loss, {name: value.item() for name, value in parts.items()}
+        loss = position + orientation + open_close
+        if contrast is not None:
+            parts["contrastive_loss"] = contrast
+            loss = loss + self.config.contrastive_weight * contrast
+        return loss, LossParts(parts)
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         raise NotImplementedError("LanSAR decides one action at a time: use select_action.")
@@ -136,13 +182,10 @@ class LanSARPolicy(PreTrainedPolicy):
         self._check(batch, state, environment_state)
         inputs = [state, environment_state, batch[CLIP_COMMAND]]
         inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
-        histories = self._recall(batch["task"])
-        # On a CPU one environment at a time: batching gains little there, and the size of a matrix product
-        # changes its last bits. So results are exactly the same for every batch size; on a GPU they are up to
-        # rounding.
-        size = 1 if state.device.type == "cpu" else len(state)
+        self._recall(batch["task"])
+        size = 1 if one_row_at_a_time(state.device) else len(state)
         chunks = [
-            self._act(histories[i : i + size], *(x[i : i + size] for x in inputs))
+            self._act(list(range(len(state)))[i : i + size], *(x[i : i + size] for x in inputs))
             for i in range(0, len(state), size)
         ]
         return torch.cat(chunks)
@@ -168,14 +211,16 @@ class LanSARPolicy(PreTrainedPolicy):
                         f"Set --env.control_mode={mine} or --policy.control_mode={env}."
                     )
 
-    def _recall(self, tasks: list[str]) -> list[History]:
-        """Each environment's history, empty where its command changed or the time to forget has come."""
+    def _recall(self, tasks: list[str]) -> None:
+        """Keep each environment's history, empty where its command changed or the time to forget has come."""
         if len(self._histories) != len(tasks):
+            parameter = self.network.cls.weight
             self._histories = [self._blank("") for _ in tasks]
+            self._cache = DecoderCache(self.network.config, len(tasks), parameter)
         for i, (history, command) in enumerate(zip(self._histories, tasks, strict=True)):
             if history.command != command or history.steps >= self.config.history_clear_steps:
                 self._histories[i] = self._blank(command)
-        return self._histories
+                self._cache.steps[i] = 0
 
     def _blank(self, command: str) -> History:
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
@@ -183,34 +228,35 @@ class LanSARPolicy(PreTrainedPolicy):
 
     def _act(
         self,
-        histories: list[History],
+        rows: list[int],
         state: Tensor,
         environment_state: Tensor,
         command: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
     ) -> Tensor:
-        """Take one step into the histories and decide: (b, 15), (b, 24), (b, D)... -> (b, 7)."""
-        config, network = self.config, self.network
+        """Take one step into the histories of `rows` and decide: (b, 15), (b, 24), (b, D)... -> (b, 7)."""
+        config, network = self.config, self.acting
+        histories = [self._histories[row] for row in rows]
         x, blocks, scene = self.scaler.encode(state, environment_state)
         for i, history in enumerate(histories):
             if history.projections is None:
                 history.projections = network.encode_command(command[i : i + 1])
         projections = [h.projections for h in histories if h.projections is not None]
         commands = torch.cat([c for c, _ in projections]), torch.cat([c for _, c in projections])
-        contexts = network.encode_context(x, blocks, scene, static, gripper, commands[0])  # (b, h)
+        modalities = network.modalities(x, blocks, scene, static, gripper)
+        contexts = network.encode_context(modalities, commands[0])  # (b, h)
         states = network.state_target(x)
         for i, history in enumerate(histories):
+            if len(history.contexts) == config.window:  # forget the oldest steps, move the others up
+                history.contexts = history.contexts[config.window_slide :]
+                history.states = history.states[config.window_slide :]
+                self._cache.steps[rows[i]] = 0
             history.steps += 1
-            history.contexts = torch.cat([history.contexts, contexts[i : i + 1]])[-config.window :]
-            history.states = torch.cat([history.states, states[i : i + 1]])[-config.window :]
+            history.contexts = torch.cat([history.contexts, contexts[i : i + 1]])
+            history.states = torch.cat([history.states, states[i : i + 1]])
+        last = self._decode(rows, commands)
         length = torch.tensor([len(history.contexts) for history in histories], device=state.device)
-        decoded = network.decode(
-            pad_sequence([history.contexts for history in histories], batch_first=True),
-            pad_sequence([history.states for history in histories], batch_first=True),
-            commands,
-        )
-        last = decoded[torch.arange(len(histories), device=state.device), length - 1]  # (b, h)
         motion, logit = network.predict(last)
         delta = self.scaler.unscale_delta(motion)
         scale = config.position_scale_start - config.position_scale_slope * length / config.window  # Eq 4.8
@@ -221,3 +267,21 @@ class LanSARPolicy(PreTrainedPolicy):
             return torch.cat([state[:, :3] + position, wrap(state[:, 3:6] + orientation), grip], dim=1)
         relative = torch.cat([position / POSITION_UNIT, orientation / ORIENTATION_UNIT], dim=1)
         return torch.cat([relative.clamp(-1, 1), grip], dim=1)
+
+    def _decode(self, rows: list[int], commands: tuple[Tensor, Tensor]) -> Tensor:
+        """The decoder's output at the newest step of `rows`, (b, h); only steps that are not in the cache cost
+        anything.
+        """
+        last = commands[0].new_empty(len(rows), self.config.hidden)
+        groups: dict[tuple[int, bool], list[int]] = {}  # rows that need the same number of new steps
+        for i, row in enumerate(rows):
+            held = self._cache.steps[row]
+            new = len(self._histories[row].contexts) - held
+            groups.setdefault((new, held == 0), []).append(i)
+        for (new, _), members in groups.items():
+            past = self._cache.add([rows[i] for i in members], new)
+            histories = [self._histories[rows[i]] for i in members]
+            steps = (torch.stack([getattr(h, name)[-new:] for h in histories]) for name in ("contexts", "states"))
+            decoded = self.acting.decode(*steps, (commands[0][members], commands[1][members]), past)
+            last[members] = decoded[:, -1]
+        return last

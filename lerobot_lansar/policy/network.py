@@ -25,6 +25,8 @@ no separate padding mask is needed, and no padded step ever enters an MLP (it wo
 statistics).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -48,6 +50,7 @@ class NetworkConfig:
         command_in_context: the command is one more context token (section 6.5.1).
         command_prepended: C stands once at the front of memory and target instead of before every step (Table
             5.3).
+        contrastive: `forward` also returns a contrastive loss between commands and windows (section 6.5.1).
     """
 
     state_dim: int = 15
@@ -67,6 +70,10 @@ class NetworkConfig:
     use_spatial_context: bool = True
     command_in_context: bool = False
     command_prepended: bool = False
+    contrastive: bool = False
+
+
+CONTRAST_TEMPERATURE = 0.07  # CLIP's initial one
 
 
 class BatchNorm(nn.BatchNorm1d):
@@ -117,14 +124,60 @@ class Attention(nn.Module):
         self.value = nn.Linear(hidden, hidden)
         self.out = nn.Linear(hidden, hidden)
 
-    def forward(self, x: Tensor, memory: Tensor, causal: bool = False) -> Tensor:
+        self.weights: list[Tensor] | None = None  # see `recorded_attention`
+
+    def forward(
+        self,
+        x: Tensor,
+        memory: Tensor,
+        causal: bool = False,
+        past: "Past | None" = None,
+        slot: tuple[int, int] = (0, 0),
+    ) -> Tensor:
+        """x (B, t, h), memory (B, s, h) -> (B, t, h). With `past`, keys and values kept in its `slot` come
+        before those of `memory`.
+        """
         # (B, t, h) -> (B, heads, t, h/heads)
         q = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         k = self.key(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         v = self.value(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        mask = None
+        if past is not None:
+            k, v = past.extend(slot, k, v)
+            mask, causal = past.mask, False
+        if self.weights is not None:
+            self.weights.append(attention_weights(q, k, mask, causal))
         p = self.dropout if self.training else 0.0
-        y = F.scaled_dot_product_attention(q, k, v, dropout_p=p, is_causal=causal)
+        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=p, is_causal=causal)
         return self.out(y.transpose(1, 2).flatten(2))
+
+
+def attention_weights(q: Tensor, k: Tensor, mask: Tensor | None, causal: bool) -> Tensor:
+    """The weights that scaled_dot_product_attention uses and does not return (Eq 2.4): (B, heads, t, s)."""
+    scores = q @ k.transpose(-2, -1) / q.shape[-1] ** 0.5
+    if causal:
+        mask = torch.ones(scores.shape[-2:], dtype=torch.bool, device=q.device).tril()
+    if mask is not None:
+        scores = scores.masked_fill(~mask, -torch.inf)
+    return scores.softmax(dim=-1)
+
+
+@contextmanager
+def recorded_attention(layers: nn.ModuleList) -> Iterator[dict[str, list[Tensor]]]:
+    """Within it every call of `layers` also keeps its attention weights.
+
+    Yields:
+        {name of the Attention module inside `layers`: its weights (B, heads, t, s), one tensor per call}
+    """
+    modules = {name: module for name, module in layers.named_modules() if isinstance(module, Attention)}
+    records: dict[str, list[Tensor]] = {name: [] for name in modules}
+    for name, module in modules.items():
+        module.weights = records[name]
+    try:
+        yield records
+    finally:
+        for module in modules.values():
+            module.weights = None
 
 
 class FeedForward(nn.Sequential):
@@ -162,10 +215,85 @@ class DecoderLayer(nn.Module):
         self.norm1, self.norm2, self.norm3 = nn.LayerNorm(hidden), nn.LayerNorm(hidden), nn.LayerNorm(hidden)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, memory: Tensor) -> Tensor:
-        x = self.norm1(x + self.dropout(self.self_attention(x, x, causal=True)))
-        x = self.norm2(x + self.dropout(self.cross_attention(x, memory, causal=True)))
+    def forward(self, x: Tensor, memory: Tensor, past: "Past | None" = None, layer: int = 0) -> Tensor:
+        """x and memory (B, t, h) -> (B, t, h); `layer` is this layer's number in `past`."""
+        attended = self.self_attention(x, x, causal=True, past=past, slot=(layer, 0))
+        x = self.norm1(x + self.dropout(attended))
+        attended = self.cross_attention(x, memory, causal=True, past=past, slot=(layer, 1))
+        x = self.norm2(x + self.dropout(attended))
         return self.norm3(x + self.dropout(self.feedforward(x)))
+
+
+class DecoderCache:
+    """Keys and values of the decoder tokens of several environments (rows), so that a control step costs its own
+    tokens only. A token's keys and values stay right as long as its position in the window does.
+
+    Args:
+        config: the network's.
+        rows: how many environments.
+        like: a parameter; the buffers get its dtype and device.
+
+    Attributes:
+        tokens: (layers, 2: self and cross, 2: keys and values, rows, heads, tokens of a full window, h / heads).
+        steps: how many steps each row holds; setting one to 0 forgets that row.
+    """
+
+    def __init__(self, config: NetworkConfig, rows: int, like: Tensor) -> None:
+        heads, width = config.decoder_heads, config.hidden // config.decoder_heads
+        room = token_count(config, config.window)
+        self.config = config
+        self.tokens = like.new_zeros(config.decoder_layers, 2, 2, rows, heads, room, width)
+        self.steps = [0] * rows
+
+    def add(self, rows: list[int], steps: int) -> "Past":
+        """Makes room for the next `steps` steps of each of `rows`, which are then decoded at once.
+
+        Raises:
+            ValueError: the window is full, or `rows` are at their first step and others are not, where the
+                command stands once at the front.
+        """
+        held = [self.steps[row] for row in rows]
+        if max(held) + steps > self.config.window:
+            raise ValueError(f"the window of {self.config.window} steps is full")
+        if self.config.command_prepended and len({n > 0 for n in held}) > 1:
+            raise ValueError("rows at their first step have one token more than the others")
+        first = [token_count(self.config, n) for n in held]
+        count = token_count(self.config, held[0] + steps) - first[0]
+        for row in rows:
+            self.steps[row] += steps
+        return Past(self.tokens, rows, first, count)
+
+
+class Past:
+    """What attention sees of a DecoderCache while the next tokens of some rows are decoded.
+
+    Attributes:
+        positions: (B, t) place in the window of each new token.
+        mask: (B, 1, t, s) bool, True where a new token may look.
+    """
+
+    def __init__(self, tokens: Tensor, rows: list[int], first: list[int], count: int) -> None:
+        self.tokens, self.end = tokens, max(first) + count
+        device = tokens.device
+        self.rows = torch.tensor(rows, device=device)
+        in_line = rows == list(range(rows[0], rows[0] + len(rows)))
+        self.view = slice(rows[0], rows[0] + len(rows)) if in_line else self.rows  # a slice copies nothing
+        self.positions = torch.tensor(first, device=device)[:, None] + torch.arange(count, device=device)
+        self.mask = (torch.arange(self.end, device=device) <= self.positions[..., None])[:, None]
+
+    def extend(self, slot: tuple[int, int], keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Keeps new keys and values (B, heads, t, h/heads); returns all of the rows, (B, heads, s, h/heads)."""
+        kept = self.tokens[slot]
+        for buffer, new in zip(kept, (keys, values), strict=True):
+            buffer[self.rows[:, None], :, self.positions] = new.transpose(1, 2)
+        return kept[0, self.view, :, : self.end], kept[1, self.view, :, : self.end]
+
+
+def token_count(config: NetworkConfig, steps: int) -> int:
+    """Decoder tokens of a window of so many steps."""
+    if config.command_prepended:
+        return steps + (steps > 0)
+    return 2 * steps
 
 
 class LanSARNetwork(nn.Module):
@@ -207,6 +335,8 @@ class LanSARNetwork(nn.Module):
             DecoderLayer(h, c.decoder_heads, c.feedforward, p) for _ in range(c.decoder_layers)
         )
 
+        if c.contrastive:
+            self.window_projection, self.command_projection = nn.Linear(2 * h, h), nn.Linear(h, h)
         # Eq 3.25, 3.26
         self.motion_head = head_mlp(h, 6, norm, p)
         self.gripper_head = head_mlp(h, 1, norm, p)
@@ -225,29 +355,27 @@ class LanSARNetwork(nn.Module):
         each."""
         return self.command_memory(command), self.command_target(command)
 
-    def encode_context(
+    def modalities(
         self,
         state: Tensor,
         blocks: Tensor,
         scene: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
-        command: Tensor | None = None,
     ) -> Tensor:
-        """E_t of N timesteps, each on its own (Eq 3.13-3.16).
+        """What is perceived at N timesteps, one token per modality (Eq 3.6-3.12).
 
         Args:
             state: (N, state_dim) encoded and scaled robot state.
             blocks: (N, 3, block_dim), red, blue, pink.
             scene: (N, scene_dim).
             static, gripper: (N, D) CLIP embeddings of the two pictures; read only with `use_images`.
-            command: (N, h) C of each timestep's window; read only with `command_in_context`.
 
         Returns:
-            (N, h)
+            (N, m, h), the m tokens that the configuration admits.
         """
         c = self.config
-        tokens = [self.cls.weight.expand(state.shape[0], 1, -1)]
+        tokens = []
         if c.use_spatial_context:
             blocks = self.block_context(blocks.flatten(0, 1)).unflatten(0, (-1, 3))
             tokens += [self.state_context(state)[:, None], blocks, self.scene_context(scene)[:, None]]
@@ -255,8 +383,20 @@ class LanSARNetwork(nn.Module):
             assert static is not None
             assert gripper is not None
             tokens += [self.static_context(static)[:, None], self.gripper_context(gripper)[:, None]]
-        if c.command_in_context:
-            assert command is not None
+        return torch.cat(tokens, dim=1)
+
+    def encode_context(self, modalities: Tensor, command: Tensor) -> Tensor:
+        """E_t of N timesteps, each on its own (Eq 3.13-3.16).
+
+        Args:
+            modalities: (N, m, h).
+            command: (N, h) C of each timestep's window; read only with `command_in_context`.
+
+        Returns:
+            (N, h)
+        """
+        tokens = [self.cls.weight.expand(len(modalities), 1, -1), modalities]
+        if self.config.command_in_context:
             tokens.append(command[:, None])
         x = torch.cat(tokens, dim=1) + self.context_position.weight  # (N, k, h)
         for i, layer in enumerate(self.context_layers):
@@ -264,25 +404,34 @@ class LanSARNetwork(nn.Module):
             x = layer(x, queries=1 if i == len(self.context_layers) - 1 else None)
         return x[:, 0]
 
-    def decode(self, contexts: Tensor, states: Tensor, command: tuple[Tensor, Tensor]) -> Tensor:
+    def decode(
+        self, contexts: Tensor, states: Tensor, command: tuple[Tensor, Tensor], past: Past | None = None
+    ) -> Tensor:
         """What the decoder says at every X_t (Eq 3.17-3.24).
 
         Args:
             contexts: E, (B, n, h); steps past a window's end may hold anything finite.
             states: X_target, (B, n, h); likewise.
             command: C for memory and target, (B, h) each, from `encode_command`.
+            past: from `DecoderCache.add`, when the n steps are not the window's first ones: the result is then
+                the same as that of the whole window, to rounding, at the cost of n steps.
 
         Returns:
             (B, n, h)
         """
+        n = contexts.shape[1]
         memory = self._with_command(contexts, command[0])
         target = self._with_command(states, command[1])
-        length = target.shape[1]
-        memory = memory + self.memory_position.weight[:length]
-        target = target + self.target_position.weight[:length]
-        for layer in self.decoder_layers:
-            target = layer(target, memory)
-        return target[:, 1:] if self.config.command_prepended else target[:, 1::2]
+        if past is None:
+            positions: Tensor | slice = slice(target.shape[1])
+        else:
+            positions = past.positions
+            memory, target = memory[:, -positions.shape[1] :], target[:, -positions.shape[1] :]
+        memory = memory + self.memory_position.weight[positions]
+        target = target + self.target_position.weight[positions]
+        for i, layer in enumerate(self.decoder_layers):
+            target = layer(target, memory, past, i)
+        return target[:, -n:] if self.config.command_prepended else target[:, 1::2]
 
     def _with_command(self, steps: Tensor, command: Tensor) -> Tensor:
         """(B, n, h) and (B, h) -> C s C s C s ... (B, 2n, h), or prepended C s s s ... (B, 1 + n, h)."""
@@ -300,38 +449,60 @@ class LanSARNetwork(nn.Module):
         state: Tensor,
         blocks: Tensor,
         scene: Tensor,
-        valid: Tensor,
+        rows: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Predictions for every valid step of a batch of windows.
 
         Args:
             command: (B, D) CLIP text embeddings.
             state: (B, n, state_dim); blocks: (B, n, 3, block_dim); scene: (B, n, scene_dim), all scaled.
-            valid: (B, n) bool, True for real steps; each row is True up to its length, then False.
+            rows: (N,) int64, places of the valid steps among the B * n, ascending. The valid steps of a window
+                come first in it. Given as numbers and not as a mask, so that a GPU need not tell how many.
             static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
 
         Returns:
-            Motion (N, 6) and gripper logits (N,), rows in the order of `tensor[valid]`.
+            Motion (N, 6) and gripper logits (N,), in the order of `rows`; the contrastive loss, None without
+            `contrastive`.
         """
-        command_memory, command_target = self.encode_command(command)
-        window = valid.nonzero()[:, 0]  # (N,) which window each valid step belongs to
-        context = self.encode_context(
-            state[valid],
-            blocks[valid],
-            scene[valid],
-            static[valid] if static is not None else None,
-            gripper[valid] if gripper is not None else None,
-            command_memory[window],
+        batch, n = state.shape[:2]
+        state, blocks, scene = (x.flatten(0, 1)[rows] for x in (state, blocks, scene))
+        if static is not None and gripper is not None:
+            static, gripper = static.flatten(0, 1)[rows], gripper.flatten(0, 1)[rows]
+        commands = self.encode_command(command)
+        modalities, target = self.modalities(state, blocks, scene, static, gripper), self.state_target(state)
+        contexts, states = (
+            steps.new_zeros(batch * n, steps.shape[-1]).index_copy(0, rows, steps).unflatten(0, (batch, n))
+            for steps in (self.encode_context(modalities, commands[0][rows // n]), target)
         )
-        contexts = scatter_steps(context, valid)
-        states = scatter_steps(self.state_target(state[valid]), valid)
-        return self.predict(self.decode(contexts, states, (command_memory, command_target))[valid])
+        motion, logit = self.predict(self.decode(contexts, states, commands).flatten(0, 1)[rows])
+        contrast = None
+        if self.config.contrastive:
+            seen = modalities.mean(dim=1) + target
+            contrast = self._contrast(command, commands[0], seen, rows, batch, n)
+        return motion, logit, contrast
 
+    def _contrast(
+        self, command: Tensor, projected: Tensor, seen: Tensor, rows: Tensor, batch: int, n: int
+    ) -> Tensor:
+        """Pulls a command towards the windows that carry it out, away from the others (section 6.5.1).
 
-def scatter_steps(rows: Tensor, valid: Tensor) -> Tensor:
-    """Rows of valid steps (N, h) back to their places (B, n, h), zeros where padded."""
-    out = rows.new_zeros(*valid.shape, rows.shape[-1])
-    out[valid] = rows
-    return out
+        A window is described by what is seen in it on average and by how that changes from its first to its
+        last step, before command and perception meet. Windows of the same command are not held against it.
+
+        Args:
+            command: (B, D) as given, tells which are the same; projected: (B, h).
+            seen: (N, h) what is perceived at each valid step; rows: (N,) their places; batch: B; n: steps.
+        """
+        bounds = torch.arange(batch + 1, device=rows.device) * n
+        bounds = torch.searchsorted(rows, bounds)  # (B + 1,) where each window begins among the N
+        sums = seen.new_zeros(batch, seen.shape[-1]).index_add(0, rows // n, seen)
+        mean = sums / bounds.diff()[:, None]
+        change = seen[bounds[1:] - 1] - seen[bounds[:-1]]
+        windows = F.normalize(self.window_projection(torch.cat([mean, change], dim=1)), dim=1)
+        commands = F.normalize(self.command_projection(projected), dim=1)
+        logits = commands @ windows.T / CONTRAST_TEMPERATURE
+        same = (command[:, None] == command).all(dim=-1).float()
+        goal = same / same.sum(dim=1, keepdim=True)
+        return (F.cross_entropy(logits, goal) + F.cross_entropy(logits.T, goal)) / 2

@@ -9,9 +9,9 @@
 
 After it a batch has, with n steps in training and without that axis in evaluation:
 
-    observation.state (B, n, 15), observation.environment_state (B, n, 24), action (B, n, 7), action_is_pad
-    (B, n), observation.clip.command (B, D), observation.clip.static (B, n, D), observation.clip.gripper (B,
-    n, D), task [B]
+    observation.state (B, n, 15), observation.environment_state (B, n, 24), action (B, n, 7), valid_steps (N,)
+    in training: places of the steps that are no padding among the B * n, observation.clip.command (B, D),
+    observation.clip.static (B, n, D), observation.clip.gripper (B, n, D), task [B]
 """
 
 from dataclasses import dataclass, field
@@ -32,6 +32,8 @@ from .windows import Windows, get_current
 
 CLIP_COMMAND = "observation.clip.command"
 CLIP_IMAGE = {"static": "observation.clip.static", "gripper": "observation.clip.gripper"}
+
+VALID_STEPS = "valid_steps"
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
@@ -68,7 +70,11 @@ class WindowStep(ProcessorStep):
         new = transition.copy()
         new[TransitionKey.OBSERVATION] = observation
         new[TransitionKey.ACTION] = window["target"]
-        new[TransitionKey.COMPLEMENTARY_DATA] = {**extra, "action_is_pad": window["pad"]}
+        new[TransitionKey.COMPLEMENTARY_DATA] = {
+            **extra,
+            "task": self.windows.say(extra["task"]),
+            VALID_STEPS: window["valid_steps"],
+        }
         return new
 
     def transform_features(self, features: Features) -> Features:

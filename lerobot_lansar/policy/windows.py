@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .frames import load_embeddings, load_frames
+from .frames import load_embeddings, load_frames, load_paraphrases
 
 if TYPE_CHECKING:
     from .configuration_lansar import LanSARConfig
@@ -99,6 +99,7 @@ class Windows:
         embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
         clip_info: clip.json's contents, empty without `use_images`.
         clip: the policy's choice of CLIP.
+        sentences: other words for each command, from `load_paraphrases`; empty without `paraphrases`.
 
     Raises:
         ValueError, FileNotFoundError: the dataset cannot be used; the message says why and what to do.
@@ -118,7 +119,12 @@ class Windows:
                     "--policy.target=achieved needs episodes of at least two frames; one is shorter."
                 )
         self.clip = config.clip
-        self.embeddings: dict[str, np.ndarray] = {}
+        self.arrays: dict[str, np.ndarray | Tensor] = {
+            "state": self.frames["state"],
+            "environment_state": self.frames["environment_state"],
+            "target": self.targets,
+        }
+        self.embeddings: dict[str, np.ndarray | Tensor] = {}
         self.clip_info: dict = {}
         if config.use_images:
             self.embeddings, self.clip_info = load_embeddings(root, total_frames)
@@ -130,6 +136,9 @@ class Windows:
                     "--policy.clip.model and --policy.clip.pretrained to those of the conversion, or convert "
                     "the dataset again."
                 )
+        self.sentences = load_paraphrases(root) if config.paraphrases else {}
+        self.device = torch.device(config.device or "cpu")
+        self._move_to_gpu()
 
     def bounds(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows [start, end) of the windows that sampled frames stand for.
@@ -161,23 +170,39 @@ class Windows:
             index: (B,) absolute frame numbers.
 
         Returns:
-            state (B, n, 15), environment_state (B, n, 24), target (B, n, 7) float32, pad (B, n) bool, and
-            with `use_images` static and gripper (B, n, D) float32. Padded steps repeat the window's last
-            step.
+            state (B, n, 15), environment_state (B, n, 24), target (B, n, 7) float32, valid_steps (N,) int64, the
+            places of the steps that are no padding among the B * n, and with `use_images` static and gripper
+            (B, n, D) float32. Padded steps repeat the window's last step. On a GPU if the frames fit there.
         """
         start, end = self.bounds(index)
         rows = start[:, None] + np.arange((end - start).max())
-        pad = rows >= end[:, None]
+        valid = np.flatnonzero(rows < end[:, None])
         rows = np.minimum(rows, end[:, None] - 1)
-        out = {
-            "state": torch.from_numpy(self.frames["state"][rows]),
-            "environment_state": torch.from_numpy(self.frames["environment_state"][rows]),
-            "target": torch.from_numpy(self.targets[rows]),
-            "pad": torch.from_numpy(pad),
+        places = {"rows": rows, "embeddings": self.frames["index"][rows] if self.embeddings else rows}
+        if self.on_gpu:
+            places = {name: torch.from_numpy(value).to(self.device) for name, value in places.items()}
+        out = {name: array[places["rows"]] for name, array in self.arrays.items()}
+        out |= {name: array[places["embeddings"]] for name, array in self.embeddings.items()}
+        return {name: torch.as_tensor(value).float() for name, value in out.items()} | {
+            "valid_steps": torch.from_numpy(valid)
         }
-        for name, array in self.embeddings.items():
-            out[name] = torch.from_numpy(array[self.frames["index"][rows]].astype(np.float32))
-        return out
+
+    def say(self, tasks: list[str]) -> list[str]:
+        """The commands of a batch, with `paraphrases` in random words (from torch's generator)."""
+        if not self.sentences:
+            return tasks
+        choices = [self.sentences[task] for task in tasks]
+        draws = torch.rand(len(choices)).tolist()
+        return [listed[int(draw * len(listed))] for listed, draw in zip(choices, draws, strict=True)]
+
+    def _move_to_gpu(self) -> None:
+        """The arrays onto the GPU if they take at most half of what is free there: lookups then cost no transfer."""
+        size = sum(array.nbytes for array in (*self.arrays.values(), *self.embeddings.values()))
+        self.on_gpu = self.device.type == "cuda" and size <= torch.cuda.mem_get_info(self.device)[0] / 2
+        if self.on_gpu:
+            for arrays in (self.arrays, self.embeddings):
+                for name, array in arrays.items():
+                    arrays[name] = torch.tensor(array, device=self.device)
 
 
 _current: list[Windows] = []

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from lerobot_lansar.policy import modeling_lansar
 from lerobot_lansar.policy.clip import Clip, ClipConfig, embedding_size
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
@@ -68,13 +69,13 @@ def test_the_loss_is_eq_4_6_on_scaled_targets_over_valid_steps(relative):
     batch = preprocess(sampled_frames(0, 25, 115))
     loss, parts = policy.forward(batch)
 
-    valid = ~batch["action_is_pad"]
-    assert valid.sum().item() == 20 + 64 + 4
+    rows = batch["valid_steps"]
+    assert rows.tolist() == [*range(20), *range(64, 128), *range(128, 132)]
     x, blocks, scene = policy.scaler.encode(
         batch["observation.state"], batch["observation.environment_state"]
     )
-    motion, logit = policy.network(batch["observation.clip.command"], x, blocks, scene, valid)
-    goal = batch["action"][valid]
+    motion, logit, _ = policy.network(batch["observation.clip.command"], x, blocks, scene, rows)
+    goal = batch["action"].reshape(-1, 7)[rows]
     true = (goal[:, :6] - policy.scaler.delta_mean) / policy.scaler.delta_std
     error = (motion - true).abs()
     smooth = torch.where(error < 0.1, 0.5 * error**2 / 0.1, error - 0.05)
@@ -125,20 +126,57 @@ def test_a_relative_action_is_the_difference_in_calvins_units_clipped():
     torch.testing.assert_close(action, torch.tensor([[0.5, -1, 1, 0.5, -1, 0, 1]]))
 
 
-def test_kept_contexts_give_what_the_whole_window_at_once_gives():
-    policy = make_policy(window=4)
+def windows_of(tasks, clear, window, slide):
+    """The steps that the history rules leave in the window at each step of one environment."""
+    kept, seen, windows = [], 0, []
+    for t, task in enumerate(tasks):
+        if t and (task != tasks[t - 1] or seen >= clear):
+            kept, seen = [], 0
+        if len(kept) == window:
+            kept = kept[slide:]
+        kept, seen = [*kept, t], seen + 1
+        windows.append(kept)
+    return windows
+
+
+@pytest.mark.parametrize(
+    ("slide", "options"),
+    [
+        (1, {}),
+        (32, {}),
+        (7, {"mlp_norm": "layer", "command_in_context": True}),
+        (32, {"command_prepended": True}),
+    ],
+)
+@pytest.mark.parametrize("one_by_one", [True, False])  # as on a CPU, and as on a GPU
+def test_cached_steps_give_what_the_whole_window_at_once_gives(slide, options, one_by_one, monkeypatch):
+    """200 steps of three environments: windows that slide, forgetting after 120 steps, commands that change."""
+    monkeypatch.setattr(modeling_lansar, "one_row_at_a_time", lambda device: one_by_one)
+    config = small_config(window_slide=slide, **options)
+    torch.manual_seed(0)
+    policy = LanSARPolicy(config).eval()
+    preprocess, _ = make_lansar_pre_post_processors(config)
     rng = np.random.default_rng(0)
-    seen = []
-    for _ in range(6):
-        batch, action = step(policy, rng, ["open the drawer"])
+    sentences = ["open the drawer", "lift the red block", "close the drawer"]
+    tasks = [[sentences[t // 150] for t in range(200)], ["go"] * 200, [sentences[t // 30 % 3] for t in range(200)]]
+    expected = [windows_of(row, 120, 64, slide) for row in tasks]
+    seen, predictions = [], []
+    predict = policy.network.predict
+    monkeypatch.setattr(policy.network, "predict", lambda x: predictions.append(predict(x)) or predictions[-1])
+    for t in range(200):
+        batch = preprocess({**observation(rng, 3), "task": [row[t] for row in tasks]})
         seen.append(batch)
-        window = seen[-4:]
-        state = torch.stack([b["observation.state"][0] for b in window])[None]
-        environment = torch.stack([b["observation.environment_state"][0] for b in window])[None]
-        valid = torch.ones(1, len(window), dtype=torch.bool)
-        inputs = policy.scaler.encode(state, environment)
-        motion, _ = policy.network(batch["observation.clip.command"], *inputs, valid)
-        torch.testing.assert_close(action[0, :3], state[0, -1, :3] + motion[-1, :3], atol=1e-5, rtol=1e-4)
+        predictions.clear()
+        policy.select_action(batch)
+        cached = torch.cat([motion for motion, _ in predictions])
+        assert len(predictions) == (3 if one_by_one else 1)
+        for i in range(3):
+            steps = [seen[k] for k in expected[i][t]]
+            state = torch.stack([b["observation.state"][i] for b in steps])[None]
+            environment = torch.stack([b["observation.environment_state"][i] for b in steps])[None]
+            command = batch["observation.clip.command"][i : i + 1]
+            whole, *_ = policy.network(command, *policy.scaler.encode(state, environment), torch.arange(len(steps)))
+            torch.testing.assert_close(cached[i], whole[-1], atol=1e-5, rtol=0)
 
 
 def test_a_history_is_cleared_for_the_row_whose_command_changes_and_after_the_set_steps():
@@ -177,34 +215,6 @@ def test_an_action_does_not_depend_on_its_neighbours_not_even_in_the_last_bit(op
             alone = {name: value[row : row + 1] for name, value in o.items()}
             action = policy.select_action(preprocess({**alone, "task": [task[row]]}))
             assert torch.equal(action[0], expected[row])
-
-
-def test_batched_decoding_as_on_a_gpu_agrees_with_one_by_one():
-    policy = make_policy(window=4)
-    rng = np.random.default_rng(0)
-    for t in range(5):
-        tasks = ["open the drawer", "lift" if t < 3 else "drop it"]
-        before = [list(vars(h).values()) for h in policy._histories]
-        batch, action = step(policy, rng, tasks)
-        if t == 0:
-            histories = policy._recall(tasks)
-            policy.reset()
-            histories = policy._recall(tasks)
-        else:
-            histories = [type(h)(*values) for h, values in zip(policy._histories, before, strict=True)]
-            for history, task in zip(histories, tasks, strict=True):
-                if history.command != task:
-                    blank = policy._blank(task)
-                    history.__dict__.update(vars(blank))
-        keys = ("observation.state", "observation.environment_state", "observation.clip.command")
-        kept = policy._histories
-        torch.testing.assert_close(
-            policy._act(histories, *(batch[k] for k in keys)), action, atol=1e-5, rtol=1e-4
-        )
-        if t == 0:
-            policy._histories = histories
-        else:
-            policy._histories = kept
 
 
 def test_a_control_mode_that_disagrees_with_the_env_is_an_error_naming_both_options():
