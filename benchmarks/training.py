@@ -1,7 +1,7 @@
 """How fast LanSAR trains: windows per second, and the share of the time spent waiting for data.
 
-    python benchmarks/training.py [--preset=small] [--root=DATASET] [--batch_size=24] [--updates=10]
-        [--device=cpu] [--threads=1] [--output=FILE.json]
+    python benchmarks/training.py [--preset=lansar_small] [--root=DATASET] [--batch_size=24] [--updates=10]
+        [--device=cpu] [--threads=1] [--dtype=float32] [--output=FILE.json]
 
 The loop is lerobot-train's: LeRobotDataset, DataLoader (no workers), preprocessor, forward, backward, AdamW.
 Without --root it runs on random demonstrations made in a temporary folder.
@@ -18,7 +18,7 @@ import draccus
 import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from policy_latency import load_preset
+from latency import load_preset
 from tqdm import tqdm
 
 from lerobot_lansar.policy import make_lansar_pre_post_processors
@@ -31,7 +31,7 @@ from lerobot_lansar.policy.windows import ACTION_NAMES
 class Options:
     """Command-line options."""
 
-    preset: str = "small"  # configs/lansar_<preset>.yaml
+    preset: str = "lansar_small"  # configs/<preset>.yaml
     root: Path | None = None  # a LeRobotDataset's folder
     batch_size: int = 24
     updates: int = 10  # measured, after two to warm up

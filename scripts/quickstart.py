@@ -108,7 +108,7 @@ def train(name: str, *options: str, log: Path | None = None) -> Path:
     return checkpoint
 
 
-def evaluate(name: str, checkpoint: Path, log: Path | None = None) -> Path:
+def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None) -> Path:
     """Evaluates every task from unseen starts, with the report."""
     folder = OUT / f"eval_{name}"
     if not (folder / "eval_info.json").exists():
@@ -128,6 +128,7 @@ def evaluate(name: str, checkpoint: Path, log: Path | None = None) -> Path:
             "--eval.batch_size=10",
             f"--seed={EVALUATION_SEED}",
             f"--output_dir={folder}",
+            *options,
             log=log,
         )
     run(f"report ({name})", "lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
@@ -137,9 +138,8 @@ def evaluate(name: str, checkpoint: Path, log: Path | None = None) -> Path:
 def untrained() -> Path:
     """The same network and statistics with untrained weights: one update with learning rate 0, then evaluated."""
     log = OUT / "untrained.log"
-    return evaluate(
-        "untrained", train("untrained", "--steps=1", "--policy.learning_rate=0", log=log), log=log
-    )
+    checkpoint = train("untrained", "--steps=1", "--policy.learning_rate=0", log=log)
+    return evaluate("untrained", checkpoint, "--eval.use_async_envs=false", log=log)  # leaves a core for training
 
 
 def success(folder: Path) -> dict[str, dict[str, float]]:

@@ -66,6 +66,11 @@ class CalvinEnv(gym.Env):
         results_dir: If given, every finished episode is appended to ``episodes-<process id>.jsonl`` in it.
         renderer: ``"fast"``, ``"fast_gl"`` (the look of CALVIN's public data), ``"tiny"`` or ``"egl"``; see
             :class:`~lerobot_lansar.desk.Desk`.
+        perturbation_every: If not 0, the position difference of every so many-th action is replaced by a draw from
+            the normal distribution around it with ``perturbation_scale`` times its size as standard deviation, each
+            coordinate on its own (Eq 4.9 of the thesis; its experiments are 50 and 5, 25 and 2.5, 5 and 0.5). The
+            draws depend on the episode's seed.
+        perturbation_scale: Gamma of that equation.
         render_fps: How often ``render`` draws a new picture; in between it returns the last one again.
         render_mode: ``"rgb_array"``, the static camera's picture.
 
@@ -85,6 +90,8 @@ class CalvinEnv(gym.Env):
         annotations: str | None = None,
         results_dir: str | None = None,
         renderer: str = "fast",
+        perturbation_every: int = 0,
+        perturbation_scale: float = 0.0,
         render_fps: int = CONTROL_HZ,
         render_mode: str | None = "rgb_array",
     ):
@@ -102,6 +109,14 @@ class CalvinEnv(gym.Env):
             raise DeskError(f"control_mode {control_mode!r} is unknown; it is 'rel' or 'abs'")
         if steps_per_command < 1 or not 1 <= render_fps <= CONTROL_HZ:
             raise DeskError(f"steps_per_command must be at least 1 and render_fps between 1 and {CONTROL_HZ}")
+        if perturbation_every < 0 or not 0 <= perturbation_scale < np.inf:
+            raise DeskError(
+                "perturbation_every and perturbation_scale must be 0 or more, got "
+                f"{perturbation_every} and {perturbation_scale}"
+            )
+        if (perturbation_every > 0) != (perturbation_scale > 0):
+            raise DeskError("perturbation_every and perturbation_scale go together: give both or neither")
+        self.perturbation_every, self.perturbation_scale = perturbation_every, perturbation_scale
         self.task = task
         self.control_mode = control_mode
         self.steps_per_command = steps_per_command
@@ -148,6 +163,7 @@ class CalvinEnv(gym.Env):
             start = sample_start(self._desk, self.task, np.random.default_rng(self._seed))
             obs = self._desk.reset(*start)
         self._last = obs
+        self._disturbance = np.random.default_rng([self._seed, 4, 9])
         self._done = []
         self._picture: tuple[int, np.ndarray] | None = (
             None  # the step it was drawn at, and the static picture
@@ -167,6 +183,8 @@ class CalvinEnv(gym.Env):
             raise DeskError("reset the environment before stepping it")
         if self._steps == 0:
             self._refuse_other_mode(np.asarray(action, dtype=np.float64))
+        if self.perturbation_every and (self._steps + 1) % self.perturbation_every == 0:
+            action = self._perturbed(np.array(action, dtype=np.float64))
         try:
             self._last = self._desk.step(action, self.control_mode)
         except SimulationError:  # costs this episode only; the next reset starts the desk anew
@@ -208,6 +226,14 @@ class CalvinEnv(gym.Env):
         if self._desk is not None:
             self._desk.close()
             self._desk = None
+
+    def _perturbed(self, action: np.ndarray) -> np.ndarray:
+        """Eq 4.9; an action that is not (7,) and finite is left to the desk, which says what is wrong."""
+        if action.shape == (7,) and np.isfinite(action).all():
+            origin = self._last["robot_obs"][:3] if self.control_mode == "abs" else 0.0
+            delta = action[:3] - origin
+            action[:3] = origin + self._disturbance.normal(delta, np.abs(delta) * self.perturbation_scale)
+        return action
 
     @property
     def _current(self) -> str:
@@ -271,6 +297,7 @@ class CalvinEnv(gym.Env):
             "renderer": self._desk.renderer if self._desk.cameras else None,
             "control_mode": self.control_mode,
             "steps_per_command": self.steps_per_command,
+            "perturbation": [self.perturbation_every, self.perturbation_scale],
             "version": version("lerobot_policy_lansar"),
         }
         self._results_dir.mkdir(parents=True, exist_ok=True)

@@ -35,6 +35,8 @@ class CalvinEnvConfig(EnvConfig):
     annotations: str | None = None
     results_dir: str | None = None
     renderer: str = "fast"
+    perturbation_every: int = 0
+    perturbation_scale: float = 0.0
     render_fps: int = 30
 
     def __post_init__(self) -> None:
@@ -73,6 +75,8 @@ class CalvinEnvConfig(EnvConfig):
             "annotations",
             "results_dir",
             "renderer",
+            "perturbation_every",
+            "perturbation_scale",
         )
         return {name: getattr(self, name) for name in names} | {"render_fps": self.render_fps}
 

@@ -27,7 +27,7 @@ CHOICES = {
 class LanSARConfig(PreTrainedConfig):
     """Every option of LanSAR: network, data, loss, optimizer, inference.
 
-    The thesis to the letter is `configs/lansar_thesis.yaml`. The defaults here are its sizes (Table 4.2),
+    The thesis to the letter is `configs/thesis/baseline.yaml`. The defaults here are its sizes (Table 4.2),
     with targets from the commanded action (a probe found them to be the first lever), an orientation input
     without the jump at +-pi, and inference that takes the prediction as it is.
 

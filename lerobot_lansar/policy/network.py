@@ -400,8 +400,10 @@ class LanSARNetwork(nn.Module):
             tokens.append(command[:, None])
         x = torch.cat(tokens, dim=1) + self.context_position.weight  # (N, k, h)
         for i, layer in enumerate(self.context_layers):
-            # Only CLS is read at the end, so the last layer need not update the other tokens.
-            x = layer(x, queries=1 if i == len(self.context_layers) - 1 else None)
+            # Only CLS is read at the end, so the last layer need not update the other tokens, unless one wants to
+            # see what they attend to.
+            is_last = i == len(self.context_layers) - 1
+            x = layer(x, queries=1 if is_last and layer.attention.weights is None else None)
         return x[:, 0]
 
     def decode(

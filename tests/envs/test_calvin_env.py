@@ -159,6 +159,47 @@ def test_an_episode_that_ended_cannot_be_stepped_on():
     env.close()
 
 
+@pytest.mark.parametrize("mode", ["rel", "abs"])
+def test_every_kth_action_is_disturbed_as_equation_4_9_says(mode, monkeypatch):
+    options = {"control_mode": mode, "perturbation_every": 3, "perturbation_scale": 5.0}
+    env = CalvinEnv("open_drawer", cameras=(), **options)
+    obs, _ = env.reset(seed=1)
+    given = [np.array([0.4, 0.0, -0.2, 0, 0, 0.1, 1.0]) for _ in range(9)]
+    done = []
+    step = env._desk.step
+    monkeypatch.setattr(env._desk, "step", lambda action, m: done.append(action) or step(action, m))
+    for k, action in enumerate(given):
+        if mode == "abs":
+            given[k] = action = np.r_[obs["agent_pos"][:3] + 0.02 * action[:3], obs["agent_pos"][3:6], 1]
+        before = obs["agent_pos"][:3]
+        obs = env.step(action)[0]
+        if k % 3 == 2:
+            origin = before if mode == "abs" else 0
+            difference, wanted = done[k][:3] - origin, given[k][:3] - origin
+            assert (difference[[0, 2]] != wanted[[0, 2]]).all()
+            assert difference[1] == pytest.approx(0, abs=1e-12)  # sigma is proportional to the difference
+            np.testing.assert_array_equal(done[k][3:], given[k][3:])
+        else:
+            np.testing.assert_array_equal(done[k], given[k])
+    monkeypatch.undo()
+    env.reset(seed=1)
+    draws = [env._perturbed(np.array([1.0, 1, 1, 0, 0, 0, 1]))[:3] for _ in range(2000)]
+    if mode == "rel":
+        assert np.mean(draws) == pytest.approx(1, abs=0.3)
+        assert np.std(draws) == pytest.approx(5, rel=0.05)
+    env.close()
+
+
+def test_disturbances_depend_on_the_seed_alone():
+    draws = []
+    for seed in (4, 4, 5):
+        env = CalvinEnv("open_drawer", cameras=(), perturbation_every=1, perturbation_scale=1.0)
+        env.reset(seed=seed)
+        draws.append(env._perturbed(np.ones(7))[0])
+        env.close()
+    assert draws[0] == draws[1] != draws[2]
+
+
 def test_pictures_are_drawn_at_the_rate_asked_for():
     env = CalvinEnv("open_drawer", cameras=(), render_fps=10)
     env.reset(seed=0)
@@ -178,6 +219,8 @@ def test_options_are_checked_by_name(tmp_path):
         CalvinEnv(scene="A")
     with pytest.raises(DeskError, match="'joint' is unknown"):
         CalvinEnv(control_mode="joint")
+    with pytest.raises(DeskError, match="give both or neither"):
+        CalvinEnv(perturbation_every=5)
     with pytest.raises(DeskError, match="does not exist"):
         CalvinEnv(annotations=str(tmp_path / "none.yaml"))
     with pytest.raises(DeskError, match="reset the environment"):

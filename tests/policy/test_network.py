@@ -8,11 +8,13 @@ import torch
 from torch import nn
 
 from lerobot_lansar.policy.network import (
+    Attention,
     BatchNorm,
     DecoderLayer,
     EncoderLayer,
     LanSARNetwork,
     NetworkConfig,
+    recorded_attention,
 )
 
 TINY = NetworkConfig(
@@ -212,3 +214,59 @@ def test_a_single_row_passes_batch_norm_in_training():
     network = build().train()
     motion, *_ = network(**windows(TINY, [1]))
     assert motion.shape == (1, 6)
+
+
+def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise():
+    network = build().eval()
+    inputs = windows(TINY, [5])
+    plain = network(**inputs)[0]
+    with recorded_attention(network.context_layers) as context, recorded_attention(network.decoder_layers) as decoder:
+        torch.testing.assert_close(network(**inputs)[0], plain)
+    assert all(not module.weights for module in network.modules() if isinstance(module, Attention))
+    assert {name: [tuple(w.shape) for w in calls] for name, calls in context.items()} == {
+        f"{i}.attention": [(5, 2, 8, 8)] for i in range(2)
+    }
+    (weights,) = decoder["1.cross_attention"]
+    assert weights.shape == (1, 2, 10, 10)
+    torch.testing.assert_close(weights.sum(-1), torch.ones(1, 2, 10))
+    assert (weights.triu(1) == 0).all()
+
+    attention = network.decoder_layers[0].self_attention
+    x = torch.randn(1, 6, TINY.hidden)
+    attention.weights = []
+    out = attention(x, x, causal=True)
+    values = attention.value(x).unflatten(-1, (2, -1)).transpose(1, 2)
+    mixed = (attention.weights[0] @ values).transpose(1, 2).flatten(2)
+    torch.testing.assert_close(attention.out(mixed), out)
+
+
+def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
+    network = build(contrastive=True).eval()
+    inputs = windows(TINY, [4, 6, 3, 5])
+    inputs["command"][3] = inputs["command"][0]  # two windows of one command
+    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(60):
+        *_, loss = network(**inputs)
+        losses.append(loss.item())
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    floor = (2 * torch.tensor(0.5).log().abs() / 4).item()  # the two windows that share a command tell nothing
+    assert losses[0] > 1.2
+    assert losses[-1] == pytest.approx(floor, abs=0.05)
+    assert build()(**windows(TINY, [4]))[2] is None
+
+
+@pytest.mark.parametrize("where", ["padding", "batch"])
+def test_the_contrastive_loss_describes_a_window_by_its_own_steps(where):
+    network = build(contrastive=True).eval()
+    inputs = windows(TINY, [4, 6])
+    before = network(**inputs)[2]
+    other = {name: value.clone() for name, value in inputs.items()}
+    if where == "padding":
+        other["state"][0, 4:] += 100
+        assert torch.equal(network(**other)[2], before)
+    else:
+        other["state"][0, 1] += 100
+        assert not torch.allclose(network(**other)[2], before)

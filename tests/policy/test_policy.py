@@ -372,3 +372,39 @@ def test_the_training_presets_are_table_4_2s():
     assert config.get_scheduler_preset().warmup_fraction == 5 / 125
     assert config.observation_delta_indices is config.action_delta_indices is None
     assert sum(LENGTHS) > 0
+
+
+def test_the_averaged_network_acts_and_is_saved(tmp_path):
+    policy = make_policy(ema_decay=0.9)
+    trained, averaged = policy.network.cls.weight, policy.acting.cls.weight
+    assert averaged is not trained
+    start = trained.detach().clone()
+    policy.update()
+    with torch.no_grad():
+        trained += 1
+    policy.update()
+    torch.testing.assert_close(averaged, start + 0.1)
+    assert len(policy.get_optim_params()) == len(list(policy.network.parameters()))
+    policy.config.input_features, policy.config.output_features = {}, {}
+    policy.save_pretrained(tmp_path)
+    torch.testing.assert_close(LanSARPolicy.from_pretrained(tmp_path).acting.cls.weight, averaged)
+    rng = np.random.default_rng(0)
+    _, action = step(policy, rng, ["open the drawer"])
+    with torch.no_grad():
+        trained += 100
+    policy.reset()
+    assert torch.equal(step(policy, np.random.default_rng(0), ["open the drawer"])[1], action)
+
+
+def test_options_of_training_change_training_only(relative):
+    config = small_config(dropout=0.0, mlp_norm="layer", state_noise=0.1, contrastive_weight=0.5)
+    policy = LanSARPolicy(config, dataset_meta=dataset_meta(relative[0]))
+    preprocess, _ = make_lansar_pre_post_processors_for(policy)
+    batch = preprocess(sampled_frames(0, 25, 115))
+    policy.train()
+    assert policy.forward(batch)[0] != policy.forward(batch)[0]
+    policy.eval()
+    loss, parts = policy.forward(batch)
+    assert loss == policy.forward(batch)[0]
+    weights = {"contrastive_loss": 0.5}
+    assert sum(weights.get(k, 1) * v for k, v in parts.items()) == pytest.approx(loss.item(), rel=1e-5)

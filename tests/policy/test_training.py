@@ -4,11 +4,16 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
+import draccus
 import pytest
 import torch
 import yaml
+
+from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
+from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 
 from .conftest import COMMANDS, SMALL, make_dataset
 
@@ -82,19 +87,95 @@ def test_lerobot_train_trains_resumes_fine_tunes_and_measures_a_held_out_loss(tm
     assert str(tmp_path) not in (checkpoint / "policy_preprocessor.json").read_text()
 
 
-@pytest.mark.parametrize("name", sorted(file.stem for file in CONFIGS.glob("*.yaml")))
+def test_two_processes_train_one_policy_save_and_resume(tmp_path):
+    """`accelerate launch` on two CPU processes, each with half of every batch."""
+    make_dataset(tmp_path / "data", "rel")
+    policy = [f"--policy.{key}={json.dumps(value)}" for key, value in SMALL.items()]
+    first = ["--policy.type=lansar", *policy, "--policy.clip.model=lansar-tiny", "--policy.clip.pretrained=",
+             "--policy.ema_decay=0.5", "--dataset.repo_id=test/desk", f"--dataset.root={tmp_path / 'data'}",
+             f"--output_dir={tmp_path / 'out'}", "--batch_size=4", "--steps=4", "--save_freq=2", "--num_workers=0",
+             "--log_freq=1"]  # fmt: skip
+    config = tmp_path / "out/checkpoints/last/pretrained_model/train_config.json"
+    launcher = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes=2"]
+    environment = {
+        **os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "OMP_NUM_THREADS": "1",
+        "ACCELERATE_USE_CPU": "1",
+    }  # fmt: skip
+    for arguments in (first, [f"--config_path={config}", "--resume=true", "--steps=6"]):
+        done = subprocess.run(
+            [*launcher, "-m", "lerobot.scripts.lerobot_train", *arguments],
+            env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr[-3000:]
+        assert "effective batch size: 8" in done.stderr + done.stdout
+    assert (tmp_path / "out/checkpoints/000006/pretrained_model/model.safetensors").is_file()
+
+
+def training_config(name):
+    """A configuration file's policy and the rest of it."""
+    text = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
+    policy = text.pop("policy")
+    assert policy.pop("type") == "lansar"
+    return draccus.decode(LanSARConfig, policy), text
+
+
+TRAINING = [
+    str(file.relative_to(CONFIGS).with_suffix(""))
+    for file in sorted(CONFIGS.rglob("*.yaml"))
+    if not file.name.startswith("eval")
+]
+
+
+@pytest.mark.parametrize("name", TRAINING)
 def test_shipped_configurations_hold_real_options_only(name):
-    import draccus
     from lerobot.configs.train import TrainPipelineConfig
 
-    from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+    _, rest = training_config(name)
+    assert set(rest) <= set(TrainPipelineConfig.__dataclass_fields__)
 
-    text = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
-    assert text["policy"].pop("type") == "lansar"
-    config = draccus.decode(LanSARConfig, text.pop("policy"))
-    assert set(text) <= set(TrainPipelineConfig.__dataclass_fields__)
-    assert config.network.hidden == (512 if name == "lansar_thesis" else 96)
-    if name == "lansar_thesis":
-        assert (config.target, config.orientation, config.window_start) == ("achieved", "euler", "episode")
-        assert (config.position_scale_start, config.position_scale_slope, config.yaw_scale) == (3, 1, 1.5)
-        assert round(config.warmup_fraction * text["steps"]) == 1200
+
+def test_the_thesis_preset_is_the_thesis():
+    config, rest = training_config("thesis/baseline")
+    assert (config.hidden, config.context_heads, config.decoder_heads, config.feedforward) == (512, 16, 8, 2048)
+    assert (config.target, config.orientation, config.window_start) == ("achieved", "euler", "episode")
+    assert (config.position_scale_start, config.position_scale_slope, config.yaw_scale) == (3, 1, 1.5)
+    assert (config.window, config.window_slide, config.history_clear_steps) == (64, 1, 120)
+    assert not (config.command_in_context or config.paraphrases or config.egocentric_blocks)
+    assert (config.contrastive_weight, config.state_noise, config.ema_decay) == (0, 0, 0)
+    assert round(config.warmup_fraction * rest["steps"]) == 1200
+    assert rest["batch_size"] * rest["steps"] == 125 * 240 * 96
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("abc", {}),
+        ("prepended", {"command_prepended": True}),
+        ("no_space", {"use_spatial_context": False}),
+        ("no_images", {"use_images": False}),
+    ],
+)
+def test_the_thesis_experiments_differ_from_its_baseline_in_what_they_say(name, changes):
+    baseline, expected = training_config("thesis/baseline")
+    config, rest = training_config(f"thesis/{name}")
+    assert asdict(config) == asdict(baseline) | changes
+    expected["output_dir"] = f"outputs/thesis/{name}"
+    if name == "abc":
+        expected["dataset"] = {"repo_id": "lansar/calvin_abc", "root": "data/calvin_abc"}
+    assert rest == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "perturbation"),
+    [("eval", (0, 0)), ("eval_perturbed_5_50", (50, 5)), ("eval_perturbed_2.5_25", (25, 2.5)),
+     ("eval_perturbed_0.5_5", (5, 0.5))],
+)  # fmt: skip
+def test_the_thesis_evaluations_are_its_protocol(name, perturbation):
+    from lerobot.configs.eval import EvalPipelineConfig
+
+    text = yaml.safe_load((CONFIGS / "thesis" / f"{name}.yaml").read_text())
+    config = draccus.decode(EvalPipelineConfig, text)
+    assert isinstance(config.env, CalvinEnvConfig)
+    assert (config.env.task, config.env.control_mode, config.env.steps_per_command) == ("lh_mtlc", "abs", 360)
+    assert (config.eval.n_episodes, config.seed) == (1000, 0)
+    assert (config.env.perturbation_every, config.env.perturbation_scale) == perturbation

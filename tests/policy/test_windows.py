@@ -222,3 +222,23 @@ def test_wrapping_goes_to_minus_pi_exclusive_pi_inclusive():
     expected = torch.tensor([0.0, 3.5 - 2 * math.pi, 2 * math.pi - 3.5, 7 - 2 * math.pi], dtype=torch.float64)
     torch.testing.assert_close(wrap(angles), expected)
     assert wrap(torch.tensor(-math.pi, dtype=torch.float64)) == math.pi
+
+
+def test_paraphrases_say_the_same_task_in_other_words(tmp_path):
+    root = tmp_path / "data"
+    make_dataset(root)
+    shown = {
+        "open_drawer": ["open the drawer", "pull the drawer", "lift it"],
+        "lift_red_block_table": ["lift the red block", "lift it"],
+    }
+    episodes = [{"task": task, "sentence": sentence} for task, said in shown.items() for sentence in said]
+    with pytest.raises(ValueError, match=r"--policy\.paraphrases=true needs task and sentence"):
+        make_windows(root, paraphrases=True)
+    (root / "meta" / "calvin_source.json").write_text(json.dumps({"episodes": episodes}))
+    windows = make_windows(root, paraphrases=True)
+    torch.manual_seed(0)
+    said = windows.say(["open the drawer"] * 50 + ["lift the red block"] * 50 + ["lift it"] * 5)
+    assert set(said[:50]) == set(shown["open_drawer"])
+    assert set(said[50:100]) == set(shown["lift_red_block_table"])
+    assert set(said[100:]) == {"lift it"}  # of two tasks: only what fits both
+    assert make_windows(root).say(["anything"]) == ["anything"]

@@ -1,0 +1,146 @@
+"""Which of LanSAR's options earn their place: same demonstrations, same number of updates, several seeds, official chains.
+
+    lansar-record --scene=D --episodes=10000 --cameras='[]' --workers=2 --output_dir=data/desk_D
+    lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --videos=false --output_dir=data/desk_D_lerobot
+    python benchmarks/ablations.py --root=data/desk_D_lerobot [--variants='[recommended,euler]'] [--seeds='[0,1,2]']
+        [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
+
+Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in desk.
+What is in --output_dir is not done again. Prints a Markdown table; --output_dir/results.json holds every run.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from tqdm import tqdm
+
+THESIS = [
+    "--policy.target=achieved",
+    "--policy.position_scale_start=3",
+    "--policy.position_scale_slope=1",
+    "--policy.yaw_scale=1.5",
+]
+VARIANTS: dict[str, list[str]] = {
+    "recommended": [],
+    "achieved targets, thesis constants": THESIS,
+    "achieved targets, as predicted": ["--policy.target=achieved"],
+    "euler angles": ["--policy.orientation=euler"],
+    "BatchNorm in the MLPs": ["--policy.mlp_norm=batch"],
+    "blocks not seen from the hand": ["--policy.egocentric_blocks=false"],
+    "command not in the context": ["--policy.command_in_context=false"],
+    "command prepended": ["--policy.command_prepended=true"],
+    "windows from the episode's start": ["--policy.window_start=episode"],
+    "windows from anywhere": ["--policy.window_start=anywhere"],
+    "contrastive loss, weight 0.1": ["--policy.contrastive_weight=0.1"],
+    "noise on the state, 0.05 sigma": ["--policy.state_noise=0.05"],
+    "paraphrases": ["--policy.paraphrases=true"],
+    "averaged weights, decay 0.998": ["--policy.ema_decay=0.998"],
+    "no averaged weights": ["--policy.ema_decay=0"],
+    "window slides by 1": ["--policy.window_slide=1"],
+}
+"""Name -> options on top of the configuration file."""
+
+
+@dataclass
+class Options:
+    """What to run."""
+
+    root: Path
+    config: Path = Path("configs/lansar_small.yaml")
+    variants: list[str] = field(default_factory=lambda: list(VARIANTS))
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    updates: int = 3000
+    chains: int = 100
+    workers: int = 2
+    output_dir: Path = Path("outputs/ablations")
+
+
+def command(name: str, *arguments: str, log: Path) -> float:
+    """Runs one of the installed commands on one thread; returns the seconds it took.
+
+    Raises:
+        RuntimeError: It failed.
+    """
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "WANDB_MODE": "disabled"}
+    started = time.time()
+    with open(log, "w") as output:
+        code = subprocess.call(
+            [str(Path(sys.executable).parent / name), *arguments], env=environment, stdout=output, stderr=output
+        )
+    if code:
+        raise RuntimeError(f"{name} ended with exit code {code}; its output is in {log}")
+    return time.time() - started
+
+
+def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
+    """One training and its evaluation, or what is there of it."""
+    folder = options.output_dir / variant.replace(" ", "_").replace(",", "").replace("'", "") / str(seed)
+    result = folder / "result.json"
+    asked = {"updates": options.updates, "chains": options.chains, "options": VARIANTS[variant]}
+    if result.exists():
+        found: dict[str, Any] = json.loads(result.read_text())
+        if {key: found[key] for key in asked} == asked:
+            return found
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
+    seconds = 0.0
+    if not checkpoint.exists():
+        subprocess.run(["rm", "-rf", str(folder / "train")], check=True)
+        seconds = command(
+            "lerobot-train", f"--config_path={options.config}", "--dataset.repo_id=lansar/ablations",
+            f"--dataset.root={options.root}", f"--output_dir={folder / 'train'}", f"--seed={seed}",
+            f"--steps={options.updates}", f"--save_freq={options.updates}", *VARIANTS[variant],
+            log=folder / "train.log",
+        )  # fmt: skip
+    subprocess.run(["rm", "-rf", str(folder / "eval")], check=True)
+    command(
+        "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=calvin", "--env.control_mode=abs",
+        "--env.cameras=[]", "--env.render_fps=1", f"--env.results_dir={folder / 'eval'}",
+        f"--eval.n_episodes={options.chains}", "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
+        f"--output_dir={folder / 'eval'}", log=folder / "eval.log",
+    )  # fmt: skip
+    command("lansar-report", f"--eval_dir={folder / 'eval'}", f"--policy_path={checkpoint}", log=folder / "report.log")
+    report = json.loads((folder / "eval" / "report.json").read_text())
+    found = asked | {
+        "variant": variant,
+        "seed": seed,
+        "train_minutes": seconds / 60,
+        **{key: report[key] for key in ("average_length", "in_a_row", "local_success_rate", "tasks")},
+    }
+    result.write_text(json.dumps(found, indent=1) + "\n")
+    return found
+
+
+def main() -> None:
+    """Runs what is missing and prints the table."""
+    options = draccus.parse(Options)
+    unknown = set(options.variants) - VARIANTS.keys()
+    if unknown:
+        sys.exit(f"--variants: unknown {sorted(unknown)}; choose among {list(VARIANTS)}")
+    runs = [(variant, seed) for seed in options.seeds for variant in options.variants]
+    with ThreadPoolExecutor(options.workers) as pool:
+        done = list(tqdm(pool.map(lambda run: measure(options, *run), runs), total=len(runs), unit="run"))
+    (options.output_dir / "results.json").write_text(json.dumps(done, indent=1) + "\n")
+    print("| variant | average length | 1 | 2 | 3 | 4 | 5 | per command |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for variant in options.variants:
+        mine = [run for run in done if run["variant"] == variant]
+        lengths = [run["average_length"] for run in mine]
+        spread = f" ± {statistics.stdev(lengths):.2f}" if len(lengths) > 1 else ""
+        row = [100 * statistics.mean(run["in_a_row"][k] for run in mine) for k in range(5)]
+        local = 100 * statistics.mean(run["local_success_rate"] for run in mine)
+        shares = " | ".join(f"{share:.0f} %" for share in row)
+        print(f"| {variant} | {statistics.mean(lengths):.2f}{spread} | {shares} | {local:.1f} % |")
+
+
+if __name__ == "__main__":
+    main()

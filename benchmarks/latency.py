@@ -1,0 +1,173 @@
+"""Milliseconds per control step: LanSAR with and without what it keeps, and LeRobot's ACT, Diffusion and VQ-BeT.
+
+    python benchmarks/latency.py [--device=cpu] [--threads=1] [--environments=1] [--steps=64] [--output=FILE.json]
+
+Weights are random, which costs the same as trained ones, and nothing is downloaded. All policies at their default
+settings, on the desk's observations (state, static 200 x 200 and gripper 84 x 84 picture; Diffusion and VQ-BeT, which take
+pictures of one size only, or one picture, get the static one). Counted per executed action: a policy that predicts
+chunks is asked as often as it predicts, and the time divided by the actions carried out.
+
+LanSAR is measured with a full history: 64 control steps, of which those with --policy.window_slide=32 decode their whole
+window twice. 30 Hz leaves 33 ms per step.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import draccus
+import torch
+import yaml
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.factory import get_policy_class
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from tqdm import tqdm
+
+from lerobot_lansar.policy import LanSARConfig, make_lansar_pre_post_processors
+from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
+@dataclass
+class Options:
+    """What to measure."""
+
+    device: str = "cpu"
+    threads: int = 1
+    environments: int = 1
+    steps: int = 64  # of LanSAR, after its history is full; the others carry out two chunks, 16 actions at least
+    output: Path | None = None
+
+
+def load_preset(name: str, device: str, **changes: Any) -> LanSARConfig:
+    """The policy section of a shipped configuration file, CLIP untrained so that nothing is downloaded."""
+    options = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["policy"]
+    options.pop("type")
+    options["device"] = device
+    options["clip"]["pretrained"] = ""
+    config = draccus.decode(LanSARConfig, options | changes)
+    config.input_features, config.output_features = {}, {}
+    return config
+
+
+def observation(rows: int, device: str) -> dict[str, Any]:
+    """Random numbers in the shapes of the desk's observation."""
+    return {
+        "observation.state": torch.randn(rows, 15, device=device),
+        "observation.environment_state": torch.randn(rows, 24, device=device),
+        "observation.images.static": torch.rand(rows, 3, 200, 200, device=device),
+        "observation.images.gripper": torch.rand(rows, 3, 84, 84, device=device),
+        "task": ["open the drawer"] * rows,
+    }
+
+
+def timed(options: Options, call: Callable[[], Any]) -> float:
+    """Seconds of one call, a GPU's work included."""
+    if options.device.startswith("cuda"):
+        torch.cuda.synchronize()
+    started = time.perf_counter()
+    call()
+    if options.device.startswith("cuda"):
+        torch.cuda.synchronize()
+    return time.perf_counter() - started
+
+
+def lansar(options: Options, preset: str, slide: int, name: str) -> dict[str, Any]:
+    """One LanSAR with a full window."""
+    config = load_preset(preset, options.device, window_slide=slide, history_clear_steps=10**9)
+    policy = LanSARPolicy(config).to(options.device).eval()
+    preprocess, _ = make_lansar_pre_post_processors(config)
+    seconds = {"preprocessor": 0.0, "policy": 0.0}
+    seen = preprocess(observation(options.environments, options.device))
+    for _ in range(config.window):  # the history; embeddings are random here
+        policy.select_action(seen)
+    for _ in tqdm(range(options.steps), desc=name, leave=False):
+        batch = observation(options.environments, options.device)
+        seconds["preprocessor"] += timed(options, lambda: seen.update(preprocess(batch)))  # noqa: B023
+        seconds["policy"] += timed(options, lambda: policy.select_action(seen))
+    return row(name, policy, seconds["preprocessor"] / options.steps, seconds["policy"] / options.steps)
+
+
+def whole_window(options: Options, preset: str, name: str) -> dict[str, Any]:
+    """The network on 64 steps from scratch: what a control step costs when nothing is kept."""
+    config = load_preset(preset, options.device)
+    policy = LanSARPolicy(config).to(options.device).eval()
+    n, rows, size = config.window, options.environments, config.network.clip_dim
+    state = torch.randn(rows, n, 15, device=options.device)
+    environment_state = torch.randn(rows, n, 24, device=options.device)
+    command, static, gripper = (torch.randn(rows, *k, size, device=options.device) for k in ((), (n,), (n,)))
+    places = torch.arange(rows * n, device=options.device)
+
+    def forward() -> None:
+        with torch.no_grad():
+            inputs = policy.scaler.encode(state, environment_state)
+            policy.network(command, *inputs, places, static, gripper)
+
+    forward()
+    times = [timed(options, forward) for _ in tqdm(range(10), desc=name, leave=False)]
+    return row(name, policy, None, sum(times) / len(times))
+
+
+def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) -> dict[str, Any]:
+    """One of LeRobot's policies at its default settings."""
+    sizes = {"static": 200, "gripper": 84}
+    features = {"observation.state": PolicyFeature(FeatureType.STATE, (15,))}
+    for camera in cameras:
+        shape = (3, sizes[camera], sizes[camera])
+        features[f"observation.images.{camera}"] = PolicyFeature(FeatureType.VISUAL, shape)
+    config.input_features, config.device = features, options.device
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+    policy = get_policy_class(config.type)(config).to(options.device).eval()
+    chunk = getattr(config, "n_action_steps", None) or config.action_chunk_size
+    batch = {k: v for k, v in observation(options.environments, options.device).items() if k in features}
+    for _ in range(chunk):  # warm up, and stop at a chunk's end
+        policy.select_action(dict(batch))
+    count = chunk * max(2, -(-16 // chunk))
+    total = sum(
+        timed(options, lambda: policy.select_action(dict(batch))) for _ in tqdm(range(count), desc=name, leave=False)
+    )
+    return row(f"{name}, {chunk} actions a prediction", policy, None, total / count)
+
+
+def row(name: str, policy: torch.nn.Module, preprocessor: float | None, seconds: float) -> dict[str, Any]:
+    parameters = sum(p.numel() for p in policy.parameters())
+    milliseconds = None if preprocessor is None else 1e3 * preprocessor
+    return {"name": name, "parameters": parameters, "preprocessor_ms": milliseconds, "policy_ms": 1e3 * seconds}
+
+
+@draccus.wrap()
+def main(options: Options) -> None:
+    """Measures and prints a Markdown table."""
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    thesis, small = "thesis/baseline", "lansar_small"
+    rows = [
+        lansar(options, thesis, 32, "LanSAR thesis size, steps kept (window_slide=32)"),
+        lansar(options, thesis, 1, "LanSAR thesis size, window decoded at every step (window_slide=1)"),
+        whole_window(options, thesis, "LanSAR thesis size, nothing kept"),
+        lansar(options, small, 32, "LanSAR small, steps kept"),
+        lansar(options, small, 1, "LanSAR small, window decoded at every step"),
+        other(options, ACTConfig(pretrained_backbone_weights=None), ("static", "gripper"), "ACT"),
+        other(options, VQBeTConfig(pretrained_backbone_weights=None), ("static",), "VQ-BeT"),
+        other(options, DiffusionConfig(pretrained_backbone_weights=None), ("static",), "Diffusion"),
+    ]
+    print("| policy | parameters | preprocessor (CLIP) | policy, per executed action |\n| --- | ---: | ---: | ---: |")
+    for r in rows:
+        clip = "" if r["preprocessor_ms"] is None else f"{r['preprocessor_ms']:.1f} ms"
+        print(f"| {r['name']} | {r['parameters'] / 1e6:.1f} M | {clip} | {r['policy_ms']:.2f} ms |")
+    if options.output:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        settings = {k: v for k, v in asdict(options).items() if k != "output"}
+        options.output.write_text(json.dumps({"settings": settings, "rows": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""``lansar-attention``: what a LanSAR attends to during one rollout (Figures 6.1 and 6.4 to 6.8 of the thesis).
+
+    lansar-attention --policy.path=DIR --env.type=calvin --env.task=rotate_red_block_right --seed=0
+
+Runs one episode with LeRobot's own rollout and writes into ``--output_dir``:
+
+    context_attention.png   how much each modality is attended to in the context encoder at every step, above it frames
+    decoder_attention.png   what the decoder attends to when it decides at the steps of ``--decoder_steps``
+    rollout.mp4             the static camera
+    attention.npz           the weights themselves, see `save`
+"""
+
+import logging
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from draccus.utils import DraccusException
+from lerobot.configs import parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.envs.factory import make_env, make_env_pre_post_processors
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.io_utils import write_video
+from lerobot.utils.random_utils import set_seed
+
+from ..desk.errors import DeskError
+from ..policy.modeling_lansar import LanSARPolicy
+from ..policy.network import recorded_attention
+from .plots import plot_context_attention, plot_decoder_attention
+
+
+@dataclass
+class AttentionConfig(EvalPipelineConfig):
+    """Options of ``lerobot-eval``, and which of the decoder's decisions to draw."""
+
+    # Control steps, counted from 0, at which the decoder's attention is drawn; those after the episode's end are not.
+    decoder_steps: list[int] = field(default_factory=lambda: [0, 30])
+
+
+@dataclass
+class Attention:
+    """Attention weights of one rollout of T control steps; heads and layers are not mixed.
+
+    Attributes:
+        tokens: names of the k tokens of a timestep, CLS first.
+        context: (T, layers, heads, k, k) float32, rows attend to columns.
+        decoder: per step {"self" and "cross": (layers, heads, s) float32}: from the newest X to the s tokens of the
+            window, C and X (self) or C and E (cross) in turn.
+        frames: (T, 200, 200, 3) uint8, the static camera before each step.
+        commands: the T commands in force.
+        prepended: whether C stands only once, at the front of the window.
+    """
+
+    tokens: list[str]
+    context: np.ndarray
+    decoder: list[dict[str, np.ndarray]]
+    frames: np.ndarray
+    commands: list[str]
+    prepended: bool
+
+    def per_modality(self) -> np.ndarray:
+        """How much each token is attended to at each step, (T, k): the sum over the tokens that attend, the mean over
+        heads and layers. A step's values add up to k; 1 is what indifference would give.
+        """
+        return self.context.sum(axis=3).mean(axis=(1, 2))
+
+    def save(self, path: Path) -> None:
+        """Writes ``tokens``, ``context``, ``commands``, ``prepended`` and, for each step t, ``decoder_self_t`` and
+        ``decoder_cross_t`` into one .npz file (no pickles).
+        """
+        decoder = {
+            f"decoder_{kind}_{t}": weights
+            for t, step in enumerate(self.decoder)
+            for kind, weights in step.items()
+        }
+        np.savez_compressed(
+            path, tokens=self.tokens, context=self.context, commands=self.commands, prepended=self.prepended, **decoder
+        )
+
+
+def observe(config: AttentionConfig) -> Attention:
+    """Runs one episode, of the first of ``--env.task``'s tasks, from ``--seed``.
+
+    Raises:
+        ValueError: the policy is no LanSAR.
+        DeskError: the environment cannot be had.
+    """
+    if config.policy is None or config.policy.type != "lansar":
+        found = "none" if config.policy is None else f"a policy of type {config.policy.type}"
+        raise ValueError(f"lansar-attention needs a LanSAR checkpoint, --policy.path=DIR; got {found}")
+    if any(step < 0 for step in config.decoder_steps):
+        raise ValueError(f"--decoder_steps={config.decoder_steps}: control steps are counted from 0")
+    set_seed(config.seed)
+    envs = make_env(config.env, n_envs=1)
+    env = next(iter(next(iter(envs.values())).values()))
+    policy = make_policy(config.policy, env_cfg=config.env).eval()
+    assert isinstance(policy, LanSARPolicy)
+    overrides = {"device_processor": {"device": str(policy.config.device)}}
+    preprocessor, postprocessor = make_pre_post_processors(
+        config.policy, pretrained_path=str(config.policy.pretrained_path), preprocessor_overrides=overrides
+    )
+    env_preprocessor, env_postprocessor = make_env_pre_post_processors(config.env, config.policy)
+    network = policy.acting
+    context, decoder, commands = [], [], []
+    frames: list[np.ndarray] = []
+
+    def collect(_: LanSARPolicy) -> None:
+        context.append(np.stack([w.pop()[0].float().cpu().numpy() for w in in_context.values()]))
+        newest = {name: weights.pop()[0, :, -1].float().cpu().numpy() for name, weights in in_decoder.items()}
+        decoder.append(
+            {
+                kind: np.stack([w for name, w in newest.items() if name.endswith(f"{kind}_attention")])
+                for kind in ("self", "cross")
+            }
+        )
+        commands.append(env.call("task_description")[0])
+
+    try:
+        with (
+            torch.no_grad(),
+            recorded_attention(network.context_layers) as in_context,
+            recorded_attention(network.decoder_layers) as in_decoder,
+        ):
+            rollout(
+                env, policy, env_preprocessor, env_postprocessor, preprocessor, postprocessor,
+                seeds=None if config.seed is None else [config.seed],
+                render_callback=lambda env: frames.append(env.call("render")[0]),
+                predicted_latents_callback=collect,
+            )  # fmt: skip
+    finally:
+        env.close()
+    return Attention(
+        list(network.context_tokens), np.stack(context), decoder, np.stack(frames[: len(context)]), commands,
+        network.config.command_prepended,
+    )  # fmt: skip
+
+
+@parser.wrap()
+def run(config: AttentionConfig) -> None:
+    """Observes one rollout and writes the files."""
+    attention = observe(config)
+    folder = Path(str(config.output_dir))
+    folder.mkdir(parents=True, exist_ok=True)
+    attention.save(folder / "attention.npz")
+    write_video(str(folder / "rollout.mp4"), list(attention.frames), config.env.fps)
+    plot_context_attention(attention, folder / "context_attention.png")
+    plot_decoder_attention(attention, config.decoder_steps, folder / "decoder_attention.png")
+    share = attention.per_modality().mean(axis=0)
+    for token, value in sorted(zip(attention.tokens, share, strict=True), key=lambda row: -row[1]):
+        print(f"{token:8s} {value:6.3f}")
+    print(f"{len(attention.context)} steps; attention.npz, rollout.mp4 and the plots are in {folder}")
+
+
+def main() -> None:
+    """Entry point of ``lansar-attention``."""
+    register_third_party_plugins()
+    logging.basicConfig(level=logging.WARNING)
+    try:
+        run()
+    except (DeskError, OSError, ValueError, DraccusException) as error:
+        print(f"lansar-attention: error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

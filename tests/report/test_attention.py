@@ -1,0 +1,69 @@
+"""``lansar-attention``: the weights of a real rollout, and the files made of them."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import lerobot_policy_lansar  # noqa: F401  (registers environment and policy)
+from lerobot_lansar.policy.clip import ClipConfig
+from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+from lerobot_lansar.policy.processor_lansar import make_lansar_pre_post_processors
+from lerobot_lansar.report import attention as attention_module
+
+SMALL = {"hidden": 32, "context_layers": 2, "context_heads": 2, "decoder_layers": 3, "decoder_heads": 2}
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    torch.manual_seed(0)
+    config = LanSARConfig(
+        device="cpu", push_to_hub=False, feedforward=64, use_images=False, window=8, window_slide=4,
+        clip=ClipConfig("lansar-tiny", ""), **SMALL,
+    )  # fmt: skip
+    config.input_features, config.output_features = {}, {}
+    folder = tmp_path / "checkpoint"
+    for part in (LanSARPolicy(config), *make_lansar_pre_post_processors(config)):
+        part.save_pretrained(folder)
+    return folder
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["lansar-attention", *map(str, arguments)])
+    attention_module.main()
+
+
+def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypatch):
+    seen = []
+    observe = attention_module.observe
+    monkeypatch.setattr(attention_module, "observe", lambda config: seen.append(observe(config)) or seen[-1])
+    run(
+        monkeypatch, f"--policy.path={checkpoint}", "--env.type=calvin", "--env.task=open_drawer",
+        "--env.control_mode=abs", "--env.cameras=[]", "--env.steps_per_command=20", "--seed=3",
+        "--decoder_steps=[0,10,99]", f"--output_dir={tmp_path / 'out'}",
+    )  # fmt: skip
+    (attention,) = seen
+    assert attention.tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S"]
+    assert attention.context.shape == (20, 2, 2, 6, 6)
+    assert attention.frames.shape == (20, 200, 200, 3)
+    np.testing.assert_allclose(attention.context.sum(-1), 1, atol=1e-5)
+    np.testing.assert_allclose(attention.per_modality().sum(1), 6, atol=1e-4)
+    lengths = [step["self"].shape[-1] for step in attention.decoder]  # two tokens a step; half is forgotten at 8
+    assert lengths == [2, 4, 6, 8, 10, 12, 14, 16, *[10, 12, 14, 16] * 3]
+    for step in attention.decoder:
+        assert step["cross"].shape[:2] == (3, 2)
+        np.testing.assert_allclose(step["cross"].sum(-1), 1, atol=1e-5)
+    stored = np.load(tmp_path / "out" / "attention.npz")
+    np.testing.assert_array_equal(stored["context"], attention.context)
+    np.testing.assert_array_equal(stored["decoder_cross_19"], attention.decoder[19]["cross"])
+    for name in ("context_attention.png", "decoder_attention.png", "rollout.mp4"):
+        assert (tmp_path / "out" / name).stat().st_size > 1000
+
+
+def test_other_policies_are_refused(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", "--env.type=calvin")
+    assert stopped.value.code == 2
+    assert "needs a LanSAR checkpoint, --policy.path=DIR; got a policy of type act" in capsys.readouterr().err
