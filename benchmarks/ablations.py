@@ -1,12 +1,13 @@
-"""Which of LanSAR's options earn their place: same demonstrations, same number of updates, several seeds, official chains.
+"""Which of LanSAR's options earn their place: same demonstrations and updates, several seeds, official chains.
 
     lansar-record --scene=D --episodes=10000 --cameras='[]' --workers=2 --output_dir=data/desk_D
-    lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --videos=false --output_dir=data/desk_D_lerobot
+    lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --videos=false \
+        --output_dir=data/desk_D_lerobot
     python benchmarks/ablations.py --root=data/desk_D_lerobot [--variants='[recommended,euler]'] [--seeds='[0,1,2]']
         [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
-Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in desk.
-What is in --output_dir is not done again. Prints a Markdown table; --output_dir/results.json holds every run.
+Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
+desk. What is in --output_dir is not done again. Prints a Markdown table; --output_dir/results.json holds every run.
 """
 
 import json
@@ -74,7 +75,10 @@ def command(name: str, *arguments: str, log: Path) -> float:
     started = time.time()
     with open(log, "w") as output:
         code = subprocess.call(
-            [str(Path(sys.executable).parent / name), *arguments], env=environment, stdout=output, stderr=output
+            [str(Path(sys.executable).parent / name), *arguments],
+            env=environment,
+            stdout=output,
+            stderr=output,
         )
     if code:
         raise RuntimeError(f"{name} ended with exit code {code}; its output is in {log}")
@@ -108,7 +112,12 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
         f"--eval.n_episodes={options.chains}", "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
         f"--output_dir={folder / 'eval'}", log=folder / "eval.log",
     )  # fmt: skip
-    command("lansar-report", f"--eval_dir={folder / 'eval'}", f"--policy_path={checkpoint}", log=folder / "report.log")
+    command(
+        "lansar-report",
+        f"--eval_dir={folder / 'eval'}",
+        f"--policy_path={checkpoint}",
+        log=folder / "report.log",
+    )
     report = json.loads((folder / "eval" / "report.json").read_text())
     found = asked | {
         "variant": variant,

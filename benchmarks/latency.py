@@ -3,11 +3,11 @@
     python benchmarks/latency.py [--device=cpu] [--threads=1] [--environments=1] [--steps=64] [--output=FILE.json]
 
 Weights are random, which costs the same as trained ones, and nothing is downloaded. All policies at their default
-settings, on the desk's observations (state, static 200 x 200 and gripper 84 x 84 picture; Diffusion and VQ-BeT, which take
-pictures of one size only, or one picture, get the static one). Counted per executed action: a policy that predicts
-chunks is asked as often as it predicts, and the time divided by the actions carried out.
+settings, on the desk's observations (state, static 200 x 200 and gripper 84 x 84 picture; Diffusion and VQ-BeT, which
+take pictures of one size only, or one picture, get the static one). Counted per executed action: the time of a chunk is
+divided by the actions carried out.
 
-LanSAR is measured with a full history: 64 control steps, of which those with --policy.window_slide=32 decode their whole
+LanSAR is measured with a full history: 64 control steps, in which one with --policy.window_slide=32 decodes its whole
 window twice. 30 Hz leaves 33 ms per step.
 """
 
@@ -42,7 +42,9 @@ class Options:
     device: str = "cpu"
     threads: int = 1
     environments: int = 1
-    steps: int = 64  # of LanSAR, after its history is full; the others carry out two chunks, 16 actions at least
+    steps: int = (
+        64  # of LanSAR, after its history is full; the others carry out two chunks, 16 actions at least
+    )
     output: Path | None = None
 
 
@@ -131,7 +133,8 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
         policy.select_action(dict(batch))
     count = chunk * max(2, -(-16 // chunk))
     total = sum(
-        timed(options, lambda: policy.select_action(dict(batch))) for _ in tqdm(range(count), desc=name, leave=False)
+        timed(options, lambda: policy.select_action(dict(batch)))
+        for _ in tqdm(range(count), desc=name, leave=False)
     )
     return row(f"{name}, {chunk} actions a prediction", policy, None, total / count)
 
@@ -139,7 +142,12 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
 def row(name: str, policy: torch.nn.Module, preprocessor: float | None, seconds: float) -> dict[str, Any]:
     parameters = sum(p.numel() for p in policy.parameters())
     milliseconds = None if preprocessor is None else 1e3 * preprocessor
-    return {"name": name, "parameters": parameters, "preprocessor_ms": milliseconds, "policy_ms": 1e3 * seconds}
+    return {
+        "name": name,
+        "parameters": parameters,
+        "preprocessor_ms": milliseconds,
+        "policy_ms": 1e3 * seconds,
+    }
 
 
 @draccus.wrap()
@@ -159,7 +167,9 @@ def main(options: Options) -> None:
         other(options, VQBeTConfig(pretrained_backbone_weights=None), ("static",), "VQ-BeT"),
         other(options, DiffusionConfig(pretrained_backbone_weights=None), ("static",), "Diffusion"),
     ]
-    print("| policy | parameters | preprocessor (CLIP) | policy, per executed action |\n| --- | ---: | ---: | ---: |")
+    print(
+        "| policy | parameters | preprocessor (CLIP) | policy, per executed action |\n| --- | ---: | ---: | ---: |"
+    )
     for r in rows:
         clip = "" if r["preprocessor_ms"] is None else f"{r['preprocessor_ms']:.1f} ms"
         print(f"| {r['name']} | {r['parameters'] / 1e6:.1f} M | {clip} | {r['policy_ms']:.2f} ms |")

@@ -17,8 +17,8 @@ from pathlib import Path
 import draccus
 import numpy as np
 import torch
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from latency import load_preset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_lansar.policy import make_lansar_pre_post_processors

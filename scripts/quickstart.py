@@ -139,7 +139,9 @@ def untrained() -> Path:
     """The same network and statistics with untrained weights: one update with learning rate 0, then evaluated."""
     log = OUT / "untrained.log"
     checkpoint = train("untrained", "--steps=1", "--policy.learning_rate=0", log=log)
-    return evaluate("untrained", checkpoint, "--eval.use_async_envs=false", log=log)  # leaves a core for training
+    return evaluate(
+        "untrained", checkpoint, "--eval.use_async_envs=false", log=log
+    )  # leaves a core for training
 
 
 def success(folder: Path) -> dict[str, dict[str, float]]:

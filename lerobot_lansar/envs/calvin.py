@@ -297,7 +297,8 @@ class CalvinEnv(gym.Env):
             "renderer": self._desk.renderer if self._desk.cameras else None,
             "control_mode": self.control_mode,
             "steps_per_command": self.steps_per_command,
-            "perturbation": [self.perturbation_every, self.perturbation_scale],
+            "perturbation_every": self.perturbation_every,
+            "perturbation_scale": self.perturbation_scale,
             "version": version("lerobot_policy_lansar"),
         }
         self._results_dir.mkdir(parents=True, exist_ok=True)

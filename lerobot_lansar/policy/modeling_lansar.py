@@ -120,7 +120,8 @@ class LanSARPolicy(PreTrainedPolicy):
     @property
     def acting(self) -> LanSARNetwork:
         """The network that acts: the averaged one, if there is one."""
-        return self.network if self.averaged is None else self.averaged.module
+        network: LanSARNetwork = self.network if self.averaged is None else self.averaged.module  # type: ignore[assignment]
+        return network
 
     def reset(self) -> None:
         """Forget every environment's history; LeRobot calls this when a batch of episodes begins."""
@@ -281,7 +282,9 @@ class LanSARPolicy(PreTrainedPolicy):
         for (new, _), members in groups.items():
             past = self._cache.add([rows[i] for i in members], new)
             histories = [self._histories[rows[i]] for i in members]
-            steps = (torch.stack([getattr(h, name)[-new:] for h in histories]) for name in ("contexts", "states"))
-            decoded = self.acting.decode(*steps, (commands[0][members], commands[1][members]), past)
+            contexts = torch.stack([history.contexts[-new:] for history in histories])
+            states = torch.stack([history.states[-new:] for history in histories])
+            command = commands[0][members], commands[1][members]
+            decoded = self.acting.decode(contexts, states, command, past)
             last[members] = decoded[:, -1]
         return last

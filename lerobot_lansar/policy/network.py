@@ -403,7 +403,7 @@ class LanSARNetwork(nn.Module):
             # Only CLS is read at the end, so the last layer need not update the other tokens, unless one wants to
             # see what they attend to.
             is_last = i == len(self.context_layers) - 1
-            x = layer(x, queries=1 if is_last and layer.attention.weights is None else None)
+            x = layer(x, queries=1 if is_last and layer.attention.weights is None else None)  # type: ignore[union-attr]
         return x[:, 0]
 
     def decode(

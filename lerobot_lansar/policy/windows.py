@@ -127,7 +127,8 @@ class Windows:
         self.embeddings: dict[str, np.ndarray | Tensor] = {}
         self.clip_info: dict = {}
         if config.use_images:
-            self.embeddings, self.clip_info = load_embeddings(root, total_frames)
+            embeddings, self.clip_info = load_embeddings(root, total_frames)
+            self.embeddings.update(embeddings)
             named = (self.clip_info["model"], self.clip_info["embed_dim"])
             if named != (config.clip.model, config.network.clip_dim):
                 raise ValueError(

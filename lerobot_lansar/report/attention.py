@@ -78,7 +78,12 @@ class Attention:
             for kind, weights in step.items()
         }
         np.savez_compressed(
-            path, tokens=self.tokens, context=self.context, commands=self.commands, prepended=self.prepended, **decoder
+            path,
+            tokens=self.tokens,
+            context=self.context,
+            commands=self.commands,
+            prepended=self.prepended,
+            **decoder,  # type: ignore[arg-type]
         )
 
 
@@ -105,8 +110,10 @@ def observe(config: AttentionConfig) -> Attention:
     )
     env_preprocessor, env_postprocessor = make_env_pre_post_processors(config.env, config.policy)
     network = policy.acting
-    context, decoder, commands = [], [], []
+    context: list[np.ndarray] = []
+    decoder: list[dict[str, np.ndarray]] = []
     frames: list[np.ndarray] = []
+    commands: list[str] = []
 
     def collect(_: LanSARPolicy) -> None:
         context.append(np.stack([w.pop()[0].float().cpu().numpy() for w in in_context.values()]))

@@ -47,7 +47,7 @@ def plot_context_attention(attention: "Attention", path: Path) -> None:
     weights, steps = attention.per_modality(), len(attention.context)
     shown = np.unique(np.linspace(0, steps - 1, FRAMES).round().astype(int))
     figure = plt.figure(figsize=(12, 5.5), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 2))
+    above, below = figure.subfigures(2, 1, height_ratios=(1, 2))  # type: ignore[misc]
     for axes, step in zip(np.atleast_1d(above.subplots(1, len(shown))), shown, strict=True):
         axes.imshow(attention.frames[step])
         axes.set_title(f"step {step}", fontsize=8)

@@ -17,7 +17,15 @@ CHAIN_LENGTH = 5
 DEFAULT_SEED = 1000
 """LeRobot's own default of ``--seed``."""
 
-SETTINGS = ("scene", "assets", "renderer", "control_mode", "steps_per_command", "perturbation")
+SETTINGS = (
+    "scene",
+    "assets",
+    "renderer",
+    "control_mode",
+    "steps_per_command",
+    "perturbation_every",
+    "perturbation_scale",
+)
 """What an episode's line may say about how it was run."""
 
 

@@ -220,7 +220,10 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
     network = build().eval()
     inputs = windows(TINY, [5])
     plain = network(**inputs)[0]
-    with recorded_attention(network.context_layers) as context, recorded_attention(network.decoder_layers) as decoder:
+    with (
+        recorded_attention(network.context_layers) as context,
+        recorded_attention(network.decoder_layers) as decoder,
+    ):
         torch.testing.assert_close(network(**inputs)[0], plain)
     assert all(not module.weights for module in network.modules() if isinstance(module, Attention))
     assert {name: [tuple(w.shape) for w in calls] for name, calls in context.items()} == {
@@ -252,7 +255,9 @@ def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-    floor = (2 * torch.tensor(0.5).log().abs() / 4).item()  # the two windows that share a command tell nothing
+    floor = (
+        2 * torch.tensor(0.5).log().abs() / 4
+    ).item()  # the two windows that share a command tell nothing
     assert losses[0] > 1.2
     assert losses[-1] == pytest.approx(floor, abs=0.05)
     assert build()(**windows(TINY, [4]))[2] is None

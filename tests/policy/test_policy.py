@@ -158,11 +158,17 @@ def test_cached_steps_give_what_the_whole_window_at_once_gives(slide, options, o
     preprocess, _ = make_lansar_pre_post_processors(config)
     rng = np.random.default_rng(0)
     sentences = ["open the drawer", "lift the red block", "close the drawer"]
-    tasks = [[sentences[t // 150] for t in range(200)], ["go"] * 200, [sentences[t // 30 % 3] for t in range(200)]]
+    tasks = [
+        [sentences[t // 150] for t in range(200)],
+        ["go"] * 200,
+        [sentences[t // 30 % 3] for t in range(200)],
+    ]
     expected = [windows_of(row, 120, 64, slide) for row in tasks]
     seen, predictions = [], []
     predict = policy.network.predict
-    monkeypatch.setattr(policy.network, "predict", lambda x: predictions.append(predict(x)) or predictions[-1])
+    monkeypatch.setattr(
+        policy.network, "predict", lambda x: predictions.append(predict(x)) or predictions[-1]
+    )
     for t in range(200):
         batch = preprocess({**observation(rng, 3), "task": [row[t] for row in tasks]})
         seen.append(batch)
@@ -175,7 +181,9 @@ def test_cached_steps_give_what_the_whole_window_at_once_gives(slide, options, o
             state = torch.stack([b["observation.state"][i] for b in steps])[None]
             environment = torch.stack([b["observation.environment_state"][i] for b in steps])[None]
             command = batch["observation.clip.command"][i : i + 1]
-            whole, *_ = policy.network(command, *policy.scaler.encode(state, environment), torch.arange(len(steps)))
+            whole, *_ = policy.network(
+                command, *policy.scaler.encode(state, environment), torch.arange(len(steps))
+            )
             torch.testing.assert_close(cached[i], whole[-1], atol=1e-5, rtol=0)
 
 

@@ -136,11 +136,16 @@ def test_shipped_configurations_hold_real_options_only(name):
 
 def test_the_thesis_preset_is_the_thesis():
     config, rest = training_config("thesis/baseline")
-    assert (config.hidden, config.context_heads, config.decoder_heads, config.feedforward) == (512, 16, 8, 2048)
+    assert (config.hidden, config.context_heads, config.decoder_heads, config.feedforward) == (
+        512,
+        16,
+        8,
+        2048,
+    )
     assert (config.target, config.orientation, config.window_start) == ("achieved", "euler", "episode")
     assert (config.position_scale_start, config.position_scale_slope, config.yaw_scale) == (3, 1, 1.5)
     assert (config.window, config.window_slide, config.history_clear_steps) == (64, 1, 120)
-    assert not (config.command_in_context or config.paraphrases or config.egocentric_blocks)
+    assert not any((config.command_in_context, config.paraphrases, config.egocentric_blocks))
     assert (config.contrastive_weight, config.state_noise, config.ema_decay) == (0, 0, 0)
     assert round(config.warmup_fraction * rest["steps"]) == 1200
     assert rest["batch_size"] * rest["steps"] == 125 * 240 * 96

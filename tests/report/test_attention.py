@@ -50,7 +50,9 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
     assert attention.frames.shape == (20, 200, 200, 3)
     np.testing.assert_allclose(attention.context.sum(-1), 1, atol=1e-5)
     np.testing.assert_allclose(attention.per_modality().sum(1), 6, atol=1e-4)
-    lengths = [step["self"].shape[-1] for step in attention.decoder]  # two tokens a step; half is forgotten at 8
+    lengths = [
+        step["self"].shape[-1] for step in attention.decoder
+    ]  # two tokens a step; half is forgotten at 8
     assert lengths == [2, 4, 6, 8, 10, 12, 14, 16, *[10, 12, 14, 16] * 3]
     for step in attention.decoder:
         assert step["cross"].shape[:2] == (3, 2)
