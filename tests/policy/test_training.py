@@ -88,7 +88,7 @@ def test_lerobot_train_trains_resumes_fine_tunes_and_measures_a_held_out_loss(tm
 
 
 def test_two_processes_train_one_policy_save_and_resume(tmp_path):
-    """`accelerate launch` on two CPU processes, each with half of every batch."""
+    """`accelerate launch` on two processes, without a GPU on the CPU (gloo), each with a batch of its own."""
     make_dataset(tmp_path / "data", "rel")
     policy = [f"--policy.{key}={json.dumps(value)}" for key, value in SMALL.items()]
     first = ["--policy.type=lansar", *policy, "--policy.clip.model=lansar-tiny", "--policy.clip.pretrained=",
@@ -96,11 +96,13 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
              f"--output_dir={tmp_path / 'out'}", "--batch_size=4", "--steps=4", "--save_freq=2", "--num_workers=0",
              "--log_freq=1"]  # fmt: skip
     config = tmp_path / "out/checkpoints/last/pretrained_model/train_config.json"
-    launcher = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes=2"]
+    launcher = [sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2"]
     environment = {
-        **os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "OMP_NUM_THREADS": "1",
-        "ACCELERATE_USE_CPU": "1",
-    }  # fmt: skip
+        **os.environ,
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": str(tmp_path / "hf"),
+        "OMP_NUM_THREADS": "1",
+    }
     for arguments in (first, [f"--config_path={config}", "--resume=true", "--steps=6"]):
         done = subprocess.run(
             [*launcher, "-m", "lerobot.scripts.lerobot_train", *arguments],
