@@ -12,6 +12,7 @@ import torch
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 torch.set_num_threads(1)
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 LENGTHS = (20, 90, 9, 64)
 COMMANDS = ("open the drawer", "lift the red block", "close the drawer", "turn on the lamp")
 SMALL = {

@@ -1,12 +1,14 @@
-"""A small LanSAR learns a task in which the command decides: to reach for the block that is named.
+"""Small LanSARs learn: a made-up task in which the command decides, and recorded demonstrations of the desk."""
 
-The blocks stand where they always stand: finding them anywhere takes more data and updates than a test has.
-"""
+import json
 
+import draccus
 import numpy as np
+import pytest
 import torch
+import yaml
 
-from .conftest import dataset_meta, small_config
+from .conftest import CONFIGS, dataset_meta, small_config
 
 COLOURS = ("red", "blue", "pink")
 REACH = 0.012  # m, where the teacher closes the gripper
@@ -65,7 +67,32 @@ def record(root, episodes):
     dataset.finalize()
 
 
+def train(policy, preprocess, tasks, updates, batch_size):
+    """What lerobot-train does, in this process; `tasks` are the commands of all frames. Returns the losses."""
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    schedule = policy.config.get_scheduler_preset().build(optimizer, updates)
+    empty = {
+        "observation.state": torch.zeros(batch_size, 15),
+        "observation.environment_state": torch.zeros(batch_size, 24),
+    }
+    generator = torch.Generator().manual_seed(0)
+    losses = []
+    for _ in range(updates):
+        index = torch.randint(len(tasks), (batch_size,), generator=generator)
+        loss, _ = policy.forward(
+            preprocess({**empty, "index": index, "task": [tasks[int(i)] for i in index]})
+        )
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 10)
+        optimizer.step()
+        optimizer.zero_grad()
+        schedule.step()
+        losses.append(loss.item())
+    return losses
+
+
 def test_the_policy_learns_to_reach_for_the_block_the_command_names(tmp_path):
+    """The blocks stand where they always stand: finding them anywhere takes more than a test has."""
     from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
     from lerobot_lansar.policy.processor_lansar import make_lansar_pre_post_processors
 
@@ -77,18 +104,8 @@ def test_the_policy_learns_to_reach_for_the_block_the_command_names(tmp_path):
     config.input_features, config.output_features = {}, {}
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(tmp_path / "data")).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
-    optimizer = config.get_optimizer_preset().build(policy.parameters())
-    schedule = config.get_scheduler_preset().build(optimizer, 150)
-    empty = {"observation.state": torch.zeros(24, 15), "observation.environment_state": torch.zeros(24, 24)}
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(150):
-        index = torch.randint(30 * 20, (24,), generator=generator)
-        tasks = [f"reach for the {COLOURS[int(i) // 20 % 3]} block" for i in index]
-        loss, _ = policy.forward(preprocess({**empty, "index": index, "task": tasks}))
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        schedule.step()
+    tasks = [f"reach for the {COLOURS[i // 20 % 3]} block" for i in range(30 * 20)]
+    train(policy, preprocess, tasks, updates=150, batch_size=24)
 
     rng = np.random.default_rng(1)
     colours = [COLOURS[i % 3] for i in range(12)]
@@ -107,3 +124,57 @@ def test_the_policy_learns_to_reach_for_the_block_the_command_names(tmp_path):
     assert np.median(distances[range(12), named]) < 0.04
     assert (distances.argmin(axis=1) == named).sum() >= 9
     assert sum(state[14] < 0 for state in states) >= 6  # and closed the gripper there
+
+
+@pytest.mark.slow
+def test_the_small_preset_fits_32_demonstrations_and_repeats_them(tmp_path):
+    """400 updates on 32 recorded demonstrations of two tasks; then from the same starts on the desk."""
+    from dataset_convert.convert import ConvertConfig, convert
+    from lerobot_lansar.demos.record import RecordConfig, record
+    from lerobot_lansar.desk import TASKS, Desk
+    from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+    from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+    from lerobot_lansar.policy.processor_lansar import make_lansar_pre_post_processors
+
+    folder = record(
+        RecordConfig(tmp_path / "desk", tasks=["turn_on_led", "close_drawer"], episodes=32, validation_episodes=1,
+                     cameras=[], variety=0.0, seed=5)
+    )  # fmt: skip
+    root = convert(
+        ConvertConfig(
+            root=folder, split="training", repo_id="test/desk", output_dir=tmp_path / "data", videos=False
+        )
+    )
+    options = yaml.safe_load((CONFIGS / "lansar_small.yaml").read_text())["policy"]
+    options.pop("type")
+    config = draccus.decode(LanSARConfig, options | {"learning_rate": 2e-3})
+    config.input_features, config.output_features = {}, {}
+    torch.manual_seed(0)
+    policy = LanSARPolicy(config, dataset_meta=dataset_meta(root)).train()
+    preprocess, _ = make_lansar_pre_post_processors(config)
+    episodes = json.loads((root / "meta" / "calvin_source.json").read_text())["episodes"]
+    tasks = [e["sentence"] for e in episodes for _ in range(e["end"] - e["start"])]
+    losses = train(policy, preprocess, tasks, updates=400, batch_size=16)
+    assert np.mean(losses[:20]) > 1
+    assert np.mean(losses[-50:]) < 0.35
+
+    fulfilled = 0
+    with Desk("D", cameras=()) as desk:
+        for episode in episodes:
+            first = np.load(folder / "training" / f"episode_{episode['start']:07d}.npz")
+            obs = desk.reset(first["robot_obs"], first["scene_obs"])
+            begun = desk.snapshot()
+            policy.reset()
+            for _ in range(180):
+                seen = {
+                    "observation.state": torch.tensor(obs["robot_obs"][None], dtype=torch.float32),
+                    "observation.environment_state": torch.tensor(
+                        obs["scene_obs"][None], dtype=torch.float32
+                    ),
+                    "task": [episode["sentence"]],
+                }
+                obs = desk.step(policy.eval().select_action(preprocess(seen))[0].numpy(), "abs")
+                if TASKS[episode["task"]](begun, desk.snapshot()):
+                    fulfilled += 1
+                    break
+    assert fulfilled >= 29

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import draccus
 import pytest
@@ -15,9 +14,7 @@ import yaml
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 
-from .conftest import COMMANDS, SMALL, make_dataset
-
-CONFIGS = Path(__file__).parents[2] / "configs"
+from .conftest import COMMANDS, CONFIGS, SMALL, make_dataset
 
 # Several runs of lerobot-train in one process: importing LeRobot takes 20 s; each builds everything anew.
 RUN_IN_TURN = """
