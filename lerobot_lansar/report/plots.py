@@ -79,9 +79,10 @@ def plot_decoder_attention(attention: "Attention", steps: list[int], path: Path)
             else:
                 names = [("C" if i % 2 == 0 else other) + str(i // 2) for i in range(count)]
             image = axes.imshow(weights, aspect="auto", interpolation="nearest", cmap="viridis", vmin=0)
-            every = 1 if count <= 16 else 2 * (count // 32 + 1)  # even, so that it is always the same kind
+            # every token, or some of the odd ones: X or E
+            labelled = range(count) if count <= 16 else range(1, count, 2 * (count // 32 + 1))
             axes.set(
-                xticks=range(1, count, every), xticklabels=names[1::every], yticks=range(len(weights)),
+                xticks=labelled, xticklabels=[names[i] for i in labelled], yticks=range(len(weights)),
                 ylabel="layer", title=f"step {step}, {kind}-attention",
             )  # fmt: skip
             axes.tick_params(axis="x", labelrotation=90, labelsize=7)
