@@ -3,15 +3,17 @@
     lansar-record --scene=D --episodes=10000 --cameras='[]' --workers=2 --output_dir=data/desk_D
     lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --videos=false \
         --output_dir=data/desk_D_lerobot
-    python benchmarks/ablations.py --root=data/desk_D_lerobot [--variants='[recommended,euler]'] [--seeds='[0,1,2]']
-        [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
+    python benchmarks/ablations.py --root=data/desk_D_lerobot [--variants='[recommended,euler angles]']
+        [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
 Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
 desk. What is in --output_dir is not done again. Prints a Markdown table; --output_dir/results.json holds every run.
 """
 
+import hashlib
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -22,33 +24,36 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from filelock import FileLock
 from tqdm import tqdm
 
-THESIS = [
-    "--policy.target=achieved",
+from lerobot_lansar.policy.frames import dataset_fingerprint
+
+ACHIEVED = ["--policy.target=achieved"]
+THESIS_RULES = [
     "--policy.position_scale_start=3",
     "--policy.position_scale_slope=1",
     "--policy.yaw_scale=1.5",
+    "--policy.window_slide=1",
 ]
-VARIANTS: dict[str, list[str]] = {
-    "recommended": [],
-    "achieved targets, thesis constants": THESIS,
-    "achieved targets, as predicted": ["--policy.target=achieved"],
-    "euler angles": ["--policy.orientation=euler"],
-    "BatchNorm in the MLPs": ["--policy.mlp_norm=batch"],
-    "blocks not seen from the hand": ["--policy.egocentric_blocks=false"],
-    "command not in the context": ["--policy.command_in_context=false"],
-    "command prepended": ["--policy.command_prepended=true"],
-    "windows from the episode's start": ["--policy.window_start=episode"],
-    "windows from anywhere": ["--policy.window_start=anywhere"],
-    "contrastive loss, weight 0.1": ["--policy.contrastive_weight=0.1"],
-    "noise on the state, 0.05 sigma": ["--policy.state_noise=0.05"],
-    "paraphrases": ["--policy.paraphrases=true"],
-    "averaged weights, decay 0.998": ["--policy.ema_decay=0.998"],
-    "no averaged weights": ["--policy.ema_decay=0"],
-    "window slides by 1": ["--policy.window_slide=1"],
+VARIANTS: dict[str, tuple[list[str], list[str]]] = {
+    "recommended": ([], []),
+    "achieved targets, thesis constants": (ACHIEVED, THESIS_RULES),
+    "achieved targets, as predicted": (ACHIEVED, []),
+    "euler angles": (["--policy.orientation=euler"], []),
+    "BatchNorm in the MLPs": (["--policy.mlp_norm=batch"], []),
+    "blocks not seen from the hand": (["--policy.egocentric_blocks=false"], []),
+    "command not in the context": (["--policy.command_in_context=false"], []),
+    "command prepended": (["--policy.command_prepended=true"], []),
+    "windows from the episode's start": (["--policy.window_start=episode"], []),
+    "windows from anywhere": (["--policy.window_start=anywhere"], []),
+    "contrastive loss, weight 0.1": (["--policy.contrastive_weight=0.1"], []),
+    "noise on the state, 3 mm and 3 mrad": (["--policy.state_noise=0.003"], []),
+    "paraphrases": (["--policy.paraphrases=true"], []),
+    "averaged weights, decay 0.998": (["--policy.ema_decay=0.998"], []),
+    "window slides by 1": ([], ["--policy.window_slide=1"]),
 }
-"""Name -> options on top of the configuration file."""
+"""Name -> options of training and of evaluation, on top of the configuration file. Same training, same checkpoint."""
 
 
 @dataclass
@@ -73,7 +78,7 @@ def command(name: str, *arguments: str, log: Path) -> float:
     """
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "WANDB_MODE": "disabled"}
     started = time.time()
-    with open(log, "w") as output:
+    with open(log, "a") as output:
         code = subprocess.call(
             [str(Path(sys.executable).parent / name), *arguments],
             env=environment,
@@ -85,48 +90,47 @@ def command(name: str, *arguments: str, log: Path) -> float:
     return time.time() - started
 
 
+def key(*parts: Any) -> str:
+    """A short name for everything that decides a result."""
+    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:12]
+
+
+def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]:
+    """The checkpoint of one training and the minutes it took; done once, whoever asks first."""
+    frames = dataset_fingerprint(options.root)
+    folder = options.output_dir / key(options.config.read_text(), frames, options.updates, changes, seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint, minutes = folder / "train/checkpoints/last/pretrained_model", folder / "minutes.json"
+    with FileLock(folder / ".lock"):
+        if not minutes.exists():
+            shutil.rmtree(folder / "train", ignore_errors=True)
+            seconds = command(
+                "lerobot-train", f"--config_path={options.config}", "--dataset.repo_id=lansar/ablations",
+                f"--dataset.root={options.root}", f"--output_dir={folder / 'train'}", f"--seed={seed}",
+                f"--steps={options.updates}", f"--save_freq={options.updates}", *changes, log=folder / "train.log",
+            )  # fmt: skip
+            minutes.write_text(json.dumps(seconds / 60))
+        return checkpoint, json.loads(minutes.read_text())
+
+
 def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
     """One training and its evaluation, or what is there of it."""
-    folder = options.output_dir / variant.replace(" ", "_").replace(",", "").replace("'", "") / str(seed)
-    result = folder / "result.json"
-    asked = {"updates": options.updates, "chains": options.chains, "options": VARIANTS[variant]}
-    if result.exists():
-        found: dict[str, Any] = json.loads(result.read_text())
-        if {key: found[key] for key in asked} == asked:
-            return found
-    folder.mkdir(parents=True, exist_ok=True)
-    checkpoint = folder / "train" / "checkpoints" / "last" / "pretrained_model"
-    seconds = 0.0
-    if not checkpoint.exists():
-        subprocess.run(["rm", "-rf", str(folder / "train")], check=True)
-        seconds = command(
-            "lerobot-train", f"--config_path={options.config}", "--dataset.repo_id=lansar/ablations",
-            f"--dataset.root={options.root}", f"--output_dir={folder / 'train'}", f"--seed={seed}",
-            f"--steps={options.updates}", f"--save_freq={options.updates}", *VARIANTS[variant],
-            log=folder / "train.log",
+    training, evaluation = VARIANTS[variant]
+    checkpoint, minutes = train(options, training, seed)
+    folder = checkpoint.parents[3] / key(evaluation, options.chains)
+    if not (folder / "report.json").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        log = folder.with_suffix(".log")
+        command(
+            "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=calvin", "--env.control_mode=abs",
+            "--env.cameras=[]", "--env.render_fps=1", f"--env.results_dir={folder}", *evaluation,
+            f"--eval.n_episodes={options.chains}", "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
+            f"--output_dir={folder}", log=log,
         )  # fmt: skip
-    subprocess.run(["rm", "-rf", str(folder / "eval")], check=True)
-    command(
-        "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=calvin", "--env.control_mode=abs",
-        "--env.cameras=[]", "--env.render_fps=1", f"--env.results_dir={folder / 'eval'}",
-        f"--eval.n_episodes={options.chains}", "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
-        f"--output_dir={folder / 'eval'}", log=folder / "eval.log",
-    )  # fmt: skip
-    command(
-        "lansar-report",
-        f"--eval_dir={folder / 'eval'}",
-        f"--policy_path={checkpoint}",
-        log=folder / "report.log",
-    )
-    report = json.loads((folder / "eval" / "report.json").read_text())
-    found = asked | {
-        "variant": variant,
-        "seed": seed,
-        "train_minutes": seconds / 60,
-        **{key: report[key] for key in ("average_length", "in_a_row", "local_success_rate", "tasks")},
-    }
-    result.write_text(json.dumps(found, indent=1) + "\n")
-    return found
+        command("lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
+    report = json.loads((folder / "report.json").read_text())
+    figures = {name: report[name] for name in ("average_length", "in_a_row", "local_success_rate", "tasks")}
+    return {"variant": variant, "seed": seed, "train_minutes": minutes, **figures}
 
 
 def main() -> None:

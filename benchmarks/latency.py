@@ -12,7 +12,6 @@ window twice. 30 Hz leaves 33 ms per step.
 """
 
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -153,7 +152,6 @@ def row(name: str, policy: torch.nn.Module, preprocessor: float | None, seconds:
 @draccus.wrap()
 def main(options: Options) -> None:
     """Measures and prints a Markdown table."""
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     thesis, small = "thesis/baseline", "lansar_small"

@@ -1,14 +1,13 @@
 """How fast LanSAR trains: windows per second, and the share of the time spent waiting for data.
 
     python benchmarks/training.py [--preset=lansar_small] [--root=DATASET] [--batch_size=24] [--updates=10]
-        [--device=cpu] [--threads=1] [--dtype=float32] [--output=FILE.json]
+        [--device=cpu] [--threads=1] [--output=FILE.json]
 
 The loop is lerobot-train's: LeRobotDataset, DataLoader (no workers), preprocessor, forward, backward, AdamW.
 Without --root it runs on random demonstrations made in a temporary folder.
 """
 
 import json
-import os
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -121,7 +120,6 @@ def measure(options: Options, root: Path) -> dict:
 @draccus.wrap()
 def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")
     with tempfile.TemporaryDirectory() as scratch:
         root = options.root
         if root is None:

@@ -162,9 +162,15 @@ class Clip:
         x = x.to(self.device, torch.float32)
         # CALVIN's pictures are square, so a plain resize is open_clip's resize and centre crop.
         x = F.interpolate(x, self.image_size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
-        return self.model.encode_image((x - self._mean) / self._std)
+        with self._full_precision():
+            return self.model.encode_image((x - self._mean) / self._std)
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Tensor:
         """Commands to embeddings, (B, D) float32 on this CLIP's device."""
-        return self.model.encode_text(self.tokenizer(texts).to(self.device))
+        with self._full_precision():
+            return self.model.encode_text(self.tokenizer(texts).to(self.device))
+
+    def _full_precision(self) -> torch.autocast:
+        """An embedding is the same inside and outside a mixed-precision run."""
+        return torch.autocast(self.device.type, enabled=False)

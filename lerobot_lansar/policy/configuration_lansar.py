@@ -54,8 +54,10 @@ class LanSARConfig(PreTrainedConfig):
             start (thesis), "anywhere" = from the sampled frame, "mixed" = half of each.
         paraphrases: in training a window's command is replaced by a random one among the dataset's sentences for
             the same CALVIN task (meta/calvin_source.json says which task an episode shows).
-        state_noise: in training the robot state is disturbed by normal noise of so many standard deviations.
-        contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out.
+        state_noise: in training the robot state (but not the last gripper action) is disturbed by normal noise of this
+            standard deviation, in its own units, m and rad.
+        contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out; those
+            of the same CALVIN task are not held against each other (meta/calvin_source.json).
         ema_decay: the network that acts is a running average of the trained one with this decay; 0 = none.
         dtype: "float32", or "bfloat16" for mixed-precision training on a GPU that has it.
         smooth_l1_beta: beta of Eq 4.3, 4.4.

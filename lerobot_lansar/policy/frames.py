@@ -188,11 +188,11 @@ def load_paraphrases(root: Path) -> dict[str, list[str]]:
         ValueError: the dataset does not say which task an episode shows.
     """
     file = Path(root) / "meta" / "calvin_source.json"
-    episodes = json.loads(file.read_text())["episodes"] if file.is_file() else [{}]
+    episodes = (json.loads(file.read_text()).get("episodes") if file.is_file() else None) or [{}]
     if any(not {"task", "sentence"} <= episode.keys() for episode in episodes):
         raise ValueError(
-            f"--policy.paraphrases=true needs task and sentence of every episode in {file}, as lansar-convert "
-            "writes them: convert the dataset again, or train without (--policy.paraphrases=false)."
+            f"--policy.paraphrases and --policy.contrastive_weight need task and sentence of every episode in {file}, "
+            "as lansar-convert writes them: convert the dataset again, or train without."
         )
     by_task: dict[str, set[str]] = {}
     by_sentence: dict[str, set[str]] = {}

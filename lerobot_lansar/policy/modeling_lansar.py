@@ -1,7 +1,6 @@
 """LanSAR for LeRobot: the loss in training; at inference one action per step, a history per environment."""
 
 import logging
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from .configuration_lansar import LanSARConfig
 from .network import DecoderCache, LanSARNetwork
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, VALID_STEPS
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_GROUP, VALID_STEPS
 from .scaling import SCENE_DIM, STATE_DIM, Scaler, wrap
 from .windows import ORIENTATION_UNIT, POSITION_UNIT, Windows, set_current
 
@@ -40,17 +39,16 @@ class History:
     states: Tensor
 
 
-class LossParts(Mapping[str, float]):
-    """Loss terms that become numbers when they are read: reading them in `forward` would make a GPU wait."""
+class LossParts:
+    """Loss terms by name that become numbers when they are read, as LeRobot's metrics do after the update: reading
+    them in `forward` would make a GPU wait. No Mapping, which Accelerate would take apart in mixed precision.
+    """
 
     def __init__(self, terms: dict[str, Tensor]) -> None:
         self._terms = {name: value.detach() for name, value in terms.items()}
 
-    def __getitem__(self, name: str) -> float:
-        return self._terms[name].item()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._terms)
+    def items(self) -> list[tuple[str, float]]:
+        return [(name, value.item()) for name, value in self._terms.items()]
 
     def __len__(self) -> int:
         return len(self._terms)
@@ -93,7 +91,8 @@ class LanSARPolicy(PreTrainedPolicy):
         self.averaged: AveragedModel | None = None
         if config.ema_decay:
             average = get_ema_multi_avg_fn(config.ema_decay)
-            self.averaged = AveragedModel(self.network, multi_avg_fn=average).requires_grad_(False)
+            self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
+            self.averaged.requires_grad_(False)
         if dataset_meta is not None:
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
                 logging.warning(
@@ -119,15 +118,17 @@ class LanSARPolicy(PreTrainedPolicy):
 
     @property
     def acting(self) -> LanSARNetwork:
-        """The network that acts: the averaged one, if there is one."""
-        network: LanSARNetwork = self.network if self.averaged is None else self.averaged.module  # type: ignore[assignment]
-        return network
+        """The network that acts: the averaged one, once there is one."""
+        if self.averaged is None or self.averaged.n_averaged == 0:
+            return self.network
+        averaged: LanSARNetwork = self.averaged.module  # type: ignore[assignment]
+        return averaged
 
     def reset(self) -> None:
         """Forget every environment's history; LeRobot calls this when a batch of episodes begins."""
         self._histories: list[History] = []
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, Mapping[str, float]]:
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, LossParts]:
         """Loss of a batch of windows, averaged over their valid steps (Eq 4.3-4.6).
 
         Args:
@@ -139,12 +140,16 @@ class LanSARPolicy(PreTrainedPolicy):
         if VALID_STEPS not in batch or CLIP_COMMAND not in batch:
             raise ValueError("LanSAR's forward needs windows: pass the batch through its preprocessor first.")
         rows = batch[VALID_STEPS]
-        state, blocks, scene = self.scaler.encode(batch[OBS_STATE], batch[OBS_ENV_STATE])
-        static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
+        state = batch[OBS_STATE]
         if self.training and self.config.state_noise:
-            state = state + self.config.state_noise * torch.randn_like(state)
+            noise = self.config.state_noise * torch.randn_like(state)
+            noise[..., -1] = 0  # the gripper action stays -1 or +1
+            state = state + noise
+        state, blocks, scene = self.scaler.encode(state, batch[OBS_ENV_STATE])
+        static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
         network = self.network if self.training else self.acting
-        motion, logit, contrast = network(batch[CLIP_COMMAND], state, blocks, scene, rows, static, gripper)
+        command, same = batch[CLIP_COMMAND], batch.get(COMMAND_GROUP)
+        motion, logit, contrast = network(command, state, blocks, scene, rows, static, gripper, same)
         goal = batch[ACTION].flatten(0, 1)[rows]  # (N, 7)
         delta = self.scaler.scale_delta(goal[:, :6])
         beta = self.config.smooth_l1_beta
@@ -185,10 +190,11 @@ class LanSARPolicy(PreTrainedPolicy):
         inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
         self._recall(batch["task"])
         size = 1 if one_row_at_a_time(state.device) else len(state)
-        chunks = [
-            self._act(list(range(len(state)))[i : i + size], *(x[i : i + size] for x in inputs))
-            for i in range(0, len(state), size)
-        ]
+        with torch.autocast(state.device.type, enabled=False):  # one step is too little work to gain from it
+            chunks = [
+                self._act(list(range(len(state)))[i : i + size], *(x[i : i + size] for x in inputs))
+                for i in range(0, len(state), size)
+            ]
         return torch.cat(chunks)
 
     def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor) -> None:

@@ -400,10 +400,8 @@ class LanSARNetwork(nn.Module):
             tokens.append(command[:, None])
         x = torch.cat(tokens, dim=1) + self.context_position.weight  # (N, k, h)
         for i, layer in enumerate(self.context_layers):
-            # Only CLS is read at the end, so the last layer need not update the other tokens, unless one wants to
-            # see what they attend to.
-            is_last = i == len(self.context_layers) - 1
-            x = layer(x, queries=1 if is_last and layer.attention.weights is None else None)  # type: ignore[union-attr]
+            # Only CLS is read at the end, so the last layer need not update the other tokens.
+            x = layer(x, queries=1 if i == len(self.context_layers) - 1 else None)
         return x[:, 0]
 
     def decode(
@@ -454,6 +452,7 @@ class LanSARNetwork(nn.Module):
         rows: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
+        group: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Predictions for every valid step of a batch of windows.
 
@@ -463,10 +462,11 @@ class LanSARNetwork(nn.Module):
             rows: (N,) int64, places of the valid steps among the B * n, ascending. The valid steps of a window
                 come first in it. Given as numbers and not as a mask, so that a GPU need not tell how many.
             static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
+            group: (B,) int64, equal for commands that ask for the same task; needed with `contrastive`.
 
         Returns:
             Motion (N, 6) and gripper logits (N,), in the order of `rows`; the contrastive loss, None without
-            `contrastive`.
+            `contrastive` or `group`.
         """
         batch, n = state.shape[:2]
         state, blocks, scene = (x.flatten(0, 1)[rows] for x in (state, blocks, scene))
@@ -480,21 +480,21 @@ class LanSARNetwork(nn.Module):
         )
         motion, logit = self.predict(self.decode(contexts, states, commands).flatten(0, 1)[rows])
         contrast = None
-        if self.config.contrastive:
+        if self.config.contrastive and group is not None:
             seen = modalities.mean(dim=1) + target
-            contrast = self._contrast(command, commands[0], seen, rows, batch, n)
+            contrast = self._contrast(group, commands[0], seen, rows, batch, n)
         return motion, logit, contrast
 
     def _contrast(
-        self, command: Tensor, projected: Tensor, seen: Tensor, rows: Tensor, batch: int, n: int
+        self, group: Tensor, projected: Tensor, seen: Tensor, rows: Tensor, batch: int, n: int
     ) -> Tensor:
         """Pulls a command towards the windows that carry it out, away from the others (section 6.5.1).
 
         A window is described by what is seen in it on average and by how that changes from its first to its
-        last step, before command and perception meet. Windows of the same command are not held against it.
+        last step, before command and perception meet. Windows of the same task are not held against it.
 
         Args:
-            command: (B, D) as given, tells which are the same; projected: (B, h).
+            group: (B,) tells which commands ask for the same task; projected: (B, h) the commands.
             seen: (N, h) what is perceived at each valid step; rows: (N,) their places; batch: B; n: steps.
         """
         bounds = torch.arange(batch + 1, device=rows.device) * n
@@ -505,6 +505,6 @@ class LanSARNetwork(nn.Module):
         windows = F.normalize(self.window_projection(torch.cat([mean, change], dim=1)), dim=1)
         commands = F.normalize(self.command_projection(projected), dim=1)
         logits = commands @ windows.T / CONTRAST_TEMPERATURE
-        same = (command[:, None] == command).all(dim=-1).float()
+        same = (group[:, None] == group).float()
         goal = same / same.sum(dim=1, keepdim=True)
         return (F.cross_entropy(logits, goal) + F.cross_entropy(logits.T, goal)) / 2

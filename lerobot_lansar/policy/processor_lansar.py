@@ -11,7 +11,8 @@ After it a batch has, with n steps in training and without that axis in evaluati
 
     observation.state (B, n, 15), observation.environment_state (B, n, 24), action (B, n, 7), valid_steps (N,)
     in training: places of the steps that are no padding among the B * n, observation.clip.command (B, D),
-    observation.clip.static (B, n, D), observation.clip.gripper (B, n, D), task [B]
+    observation.clip.static (B, n, D), observation.clip.gripper (B, n, D), task [B], and for the contrastive loss
+    command_group (B,), equal for commands that ask for the same task
 """
 
 from dataclasses import dataclass, field
@@ -34,6 +35,7 @@ CLIP_COMMAND = "observation.clip.command"
 CLIP_IMAGE = {"static": "observation.clip.static", "gripper": "observation.clip.gripper"}
 
 VALID_STEPS = "valid_steps"
+COMMAND_GROUP = "command_group"
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
@@ -75,6 +77,8 @@ class WindowStep(ProcessorStep):
             "task": self.windows.say(extra["task"]),
             VALID_STEPS: window["valid_steps"],
         }
+        if (group := self.windows.groups(extra["task"])) is not None:
+            new[TransitionKey.COMPLEMENTARY_DATA][COMMAND_GROUP] = group
         return new
 
     def transform_features(self, features: Features) -> Features:

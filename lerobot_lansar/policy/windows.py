@@ -99,7 +99,8 @@ class Windows:
         embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
         clip_info: clip.json's contents, empty without `use_images`.
         clip: the policy's choice of CLIP.
-        sentences: other words for each command, from `load_paraphrases`; empty without `paraphrases`.
+        sentences: other words for each command, from `load_paraphrases`; empty unless `paraphrases` or the
+            contrastive loss need them.
 
     Raises:
         ValueError, FileNotFoundError: the dataset cannot be used; the message says why and what to do.
@@ -137,7 +138,8 @@ class Windows:
                     "--policy.clip.model and --policy.clip.pretrained to those of the conversion, or convert "
                     "the dataset again."
                 )
-        self.sentences = load_paraphrases(root) if config.paraphrases else {}
+        self.paraphrases = config.paraphrases
+        self.sentences = load_paraphrases(root) if config.paraphrases or config.contrastive_weight else {}
         self.device = torch.device(config.device or "cpu")
         self._move_to_gpu()
 
@@ -189,12 +191,24 @@ class Windows:
         }
 
     def say(self, tasks: list[str]) -> list[str]:
-        """The commands of a batch, with `paraphrases` in random words (from torch's generator)."""
-        if not self.sentences:
+        """The commands of a batch, with `paraphrases` in random words (from torch's generator).
+
+        Not where no gradient is asked for: held-out losses are to be compared.
+        """
+        if not self.paraphrases or not torch.is_grad_enabled():
             return tasks
-        choices = [self.sentences[task] for task in tasks]
+        choices = [self.sentences.get(task, [task]) for task in tasks]
         draws = torch.rand(len(choices)).tolist()
         return [listed[int(draw * len(listed))] for listed, draw in zip(choices, draws, strict=True)]
+
+    def groups(self, tasks: list[str]) -> Tensor | None:
+        """(B,) int64, equal for commands with the same paraphrases; None where nothing asks for it."""
+        if not self.sentences:
+            return None
+        known = {tuple(listed): i for i, listed in enumerate(self.sentences.values())}
+        return torch.tensor(
+            [known[tuple(self.sentences[task])] if task in self.sentences else -1 for task in tasks]
+        )
 
     def _move_to_gpu(self) -> None:
         """The arrays onto the GPU if they take at most half of what is free there: lookups then cost no transfer."""

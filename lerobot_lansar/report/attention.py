@@ -47,7 +47,8 @@ class Attention:
 
     Attributes:
         tokens: names of the k tokens of a timestep, CLS first.
-        context: (T, layers, heads, k, k) float32, rows attend to columns.
+        context: (T, layers, heads, k, k) float32, rows attend to columns. In the last layer CLS alone attends, since
+            only it is read; the other rows are NaN.
         decoder: per step {"self" and "cross": (layers, heads, s) float32}: from the newest X to the s tokens of the
             window, C and X (self) or C and E (cross) in turn.
         frames: (T, 200, 200, 3) uint8, the static camera before each step.
@@ -63,10 +64,10 @@ class Attention:
     prepended: bool
 
     def per_modality(self) -> np.ndarray:
-        """How much each token is attended to at each step, (T, k): the sum over the tokens that attend, the mean over
-        heads and layers. A step's values add up to k; 1 is what indifference would give.
+        """How much each token is attended to at each step, (T, k): k times the mean over the tokens that attend, over
+        heads and over layers. A step's values add up to k; 1 is what indifference would give.
         """
-        return self.context.sum(axis=3).mean(axis=(1, 2))
+        return len(self.tokens) * np.nanmean(self.context, axis=3).mean(axis=(1, 2))
 
     def save(self, path: Path) -> None:
         """Writes ``tokens``, ``context``, ``commands``, ``prepended`` and, for each step t, ``decoder_self_t`` and
@@ -94,8 +95,8 @@ def observe(config: AttentionConfig) -> Attention:
         ValueError: the policy is no LanSAR.
         DeskError: the environment cannot be had.
     """
-    if config.policy is None or config.policy.type != "lansar":
-        found = "none" if config.policy is None else f"a policy of type {config.policy.type}"
+    if config.policy is None or config.policy.type != "lansar" or not config.policy.pretrained_path:
+        found = "none" if config.policy is None else f"an untrained policy of type {config.policy.type}"
         raise ValueError(f"lansar-attention needs a LanSAR checkpoint, --policy.path=DIR; got {found}")
     if any(step < 0 for step in config.decoder_steps):
         raise ValueError(f"--decoder_steps={config.decoder_steps}: control steps are counted from 0")
@@ -116,7 +117,15 @@ def observe(config: AttentionConfig) -> Attention:
     commands: list[str] = []
 
     def collect(_: LanSARPolicy) -> None:
-        context.append(np.stack([w.pop()[0].float().cpu().numpy() for w in in_context.values()]))
+        k = len(network.context_tokens)
+        layers = [
+            weights.pop()[0].float().cpu().numpy() for weights in in_context.values()
+        ]  # (heads, k or 1, k)
+        context.append(
+            np.stack(
+                [np.pad(w, ((0, 0), (0, k - w.shape[1]), (0, 0)), constant_values=np.nan) for w in layers]
+            )
+        )
         newest = {name: weights.pop()[0, :, -1].float().cpu().numpy() for name, weights in in_decoder.items()}
         decoder.append(
             {

@@ -227,7 +227,8 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
         torch.testing.assert_close(network(**inputs)[0], plain)
     assert all(not module.weights for module in network.modules() if isinstance(module, Attention))
     assert {name: [tuple(w.shape) for w in calls] for name, calls in context.items()} == {
-        f"{i}.attention": [(5, 2, 8, 8)] for i in range(2)
+        "0.attention": [(5, 2, 8, 8)],
+        "1.attention": [(5, 2, 1, 8)],  # only CLS is read of the last layer
     }
     (weights,) = decoder["1.cross_attention"]
     assert weights.shape == (1, 2, 10, 10)
@@ -246,7 +247,7 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
 def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
     network = build(contrastive=True).eval()
     inputs = windows(TINY, [4, 6, 3, 5])
-    inputs["command"][3] = inputs["command"][0]  # two windows of one command
+    inputs["group"] = torch.tensor([0, 1, 2, 0])  # two windows of one task
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     losses = []
     for _ in range(60):
@@ -255,9 +256,7 @@ def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-    floor = (
-        2 * torch.tensor(0.5).log().abs() / 4
-    ).item()  # the two windows that share a command tell nothing
+    floor = (2 * torch.tensor(0.5).log().abs() / 4).item()  # the two windows of one task tell nothing
     assert losses[0] > 1.2
     assert losses[-1] == pytest.approx(floor, abs=0.05)
     assert build()(**windows(TINY, [4]))[2] is None
@@ -266,7 +265,7 @@ def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
 @pytest.mark.parametrize("where", ["padding", "batch"])
 def test_the_contrastive_loss_describes_a_window_by_its_own_steps(where):
     network = build(contrastive=True).eval()
-    inputs = windows(TINY, [4, 6])
+    inputs = windows(TINY, [4, 6]) | {"group": torch.tensor([0, 1])}
     before = network(**inputs)[2]
     other = {name: value.clone() for name, value in inputs.items()}
     if where == "padding":

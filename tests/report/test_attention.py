@@ -48,7 +48,10 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
     assert attention.tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S"]
     assert attention.context.shape == (20, 2, 2, 6, 6)
     assert attention.frames.shape == (20, 200, 200, 3)
-    np.testing.assert_allclose(attention.context.sum(-1), 1, atol=1e-5)
+    sums = attention.context.sum(-1)
+    np.testing.assert_allclose(sums[:, 0], 1, atol=1e-5)
+    np.testing.assert_allclose(sums[:, 1, :, 0], 1, atol=1e-5)
+    assert np.isnan(sums[:, 1, :, 1:]).all()  # of the last layer CLS alone is read
     np.testing.assert_allclose(attention.per_modality().sum(1), 6, atol=1e-4)
     lengths = [
         step["self"].shape[-1] for step in attention.decoder
@@ -68,4 +71,7 @@ def test_other_policies_are_refused(monkeypatch, capsys):
     with pytest.raises(SystemExit) as stopped:
         run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", "--env.type=calvin")
     assert stopped.value.code == 2
-    assert "needs a LanSAR checkpoint, --policy.path=DIR; got a policy of type act" in capsys.readouterr().err
+    assert (
+        "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act"
+        in capsys.readouterr().err
+    )
