@@ -1,26 +1,36 @@
-"""How fast LanSAR trains: windows per second, and the share of the time spent waiting for data.
+"""How fast LanSAR trains: what reading costs, the share of a step spent waiting for data, and its arithmetic.
 
     python benchmarks/training.py [--preset=lansar_small] [--root=DATASET] [--batch_size=24] [--updates=10]
         [--device=cpu] [--threads=1] [--output=FILE.json]
+    python benchmarks/training.py --preset=thesis/baseline --batch_size=96 --device=cuda      # the thesis' size
 
-The loop is lerobot-train's: LeRobotDataset, DataLoader (no workers), preprocessor, forward, backward, AdamW.
-Without --root it runs on random demonstrations made in a temporary folder.
+Reading: milliseconds of CPU per sample of 64-step windows (with picture embeddings if the preset uses them) the way
+LanSAR does it, by LeRobot's own delta timestamps, and the bare lookup in memory-mapped arrays, the floor.
+
+Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader without workers, preprocessor, forward, backward,
+AdamW). FLOP are counted by PyTorch; the ceiling is its product of 2048 x 2048 matrices on the same device and dtype.
+Without --root it runs on random demonstrations of 64 steps made in a temporary folder.
 """
 
+import contextlib
 import json
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import draccus
 import numpy as np
 import torch
 from latency import load_preset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
 from lerobot_lansar.policy import make_lansar_pre_post_processors
+from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.frames import CAMERAS, clip_dir, dataset_fingerprint
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.windows import ACTION_NAMES
@@ -28,26 +38,25 @@ from lerobot_lansar.policy.windows import ACTION_NAMES
 
 @dataclass
 class Options:
-    """Command-line options."""
+    """What to measure."""
 
     preset: str = "lansar_small"  # configs/<preset>.yaml
     root: Path | None = None  # a LeRobotDataset's folder
     batch_size: int = 24
     updates: int = 10  # measured, after two to warm up
     device: str = "cpu"
+    dtype: str = "float32"  # or bfloat16: mixed precision, as --policy.dtype
     threads: int = 1
     output: Path | None = None
 
 
-def random_dataset(root: Path, episodes: int = 20, length: int = 64) -> None:
-    """A LeRobotDataset of random numbers with the features LanSAR needs."""
-
-    def feature(size: int, names: list[str] | None = None) -> dict:
-        return {"dtype": "float32", "shape": (size,), "names": names}
-
+def random_dataset(root: Path, embedding: int, episodes: int = 20, length: int = 64) -> None:
+    """A LeRobotDataset of random numbers, with ``embedding`` numbers per picture among its columns if not 0."""
     sizes = {"observation.state": 15, "observation.environment_state": 24, "action": 7}
-    features = {name: feature(size) for name, size in sizes.items()}
-    features["action"] = feature(7, ACTION_NAMES["rel"])
+    if embedding:
+        sizes |= {f"observation.clip.{name}": embedding for name in CAMERAS}
+    names = {"action": ACTION_NAMES["rel"]}
+    features = {k: {"dtype": "float32", "shape": (size,), "names": names.get(k)} for k, size in sizes.items()}
     dataset = LeRobotDataset.create(
         "benchmark/random", fps=30, features=features, root=root, use_videos=False
     )
@@ -71,69 +80,143 @@ def random_embeddings(root: Path, frames: int, model: str, size: int) -> None:
     (clip_dir(root) / "clip.json").write_text(json.dumps(info))
 
 
-def measure(options: Options, root: Path) -> dict:
-    config = load_preset(options.preset, options.device)
+def cpu_ms(call: Callable[[], Any], samples: int) -> float:
+    """Milliseconds of this process' CPU per sample, after a call to warm up."""
+    call()
+    started = time.process_time()
+    call()
+    return 1e3 * (time.process_time() - started) / samples
+
+
+def reading(config: LanSARConfig, scratch: Path) -> dict[str, float]:
+    """Milliseconds of CPU per sample, three ways, on the same random demonstrations."""
+    embedding = config.network.clip_dim if config.use_images else 0
+    random_dataset(scratch / "own", 0)
+    ours = LeRobotDataset("benchmark/random", root=scratch / "own")
+    if embedding:
+        random_embeddings(scratch / "own", len(ours), config.clip.model, embedding)
+    policy = LanSARPolicy(config, dataset_meta=ours.meta)
+    preprocess, _ = make_lansar_pre_post_processors(config)
+    lookup = next(step for step in preprocess.steps if hasattr(step, "windows"))
+    loader = torch.utils.data.DataLoader(ours, 96, sampler=range(0, 960, 2))
+    found = {"LanSAR's windows": cpu_ms(lambda: [preprocess(batch) for batch in loader], 480)}
+
+    random_dataset(scratch / "lerobot", embedding)
+    meta = LeRobotDataset("benchmark/random", root=scratch / "lerobot").meta
+    keys = [key for key in meta.features if key.startswith("observation.") or key == "action"]
+    deltas = {key: [step / meta.fps for step in range(config.window)] for key in keys}
+    theirs = LeRobotDataset("benchmark/random", root=scratch / "lerobot", delta_timestamps=deltas)
+    found["LeRobot's delta timestamps"] = cpu_ms(lambda: [theirs[i] for i in range(0, 960, 120)], 8)
+
+    rows = np.random.default_rng(0).integers(0, 640, 96)
+    arrays = [*lookup.windows.arrays.values(), *lookup.windows.embeddings.values()]
+    steps = rows[:, None] + np.arange(config.window)
+    found["bare lookup"] = cpu_ms(
+        lambda: [torch.from_numpy(np.asarray(a[steps])).float() for a in arrays], 96
+    )
+    del policy
+    return found
+
+
+def ceiling(device: str, dtype: torch.dtype) -> float:
+    """TFLOP/s of a large matrix product."""
+    a, b = (torch.randn(2048, 2048, device=device, dtype=dtype) for _ in range(2))
+    count = 200 if device.startswith("cuda") else 4
+    for _ in range(2):
+        a @ b
+    finished(device)
+    started = time.perf_counter()
+    for _ in range(count):
+        a @ b
+    finished(device)
+    return count * 2 * 2048**3 / (time.perf_counter() - started) / 1e12
+
+
+def finished(device: str) -> None:
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any]:
+    """Times of whole updates."""
     dataset = LeRobotDataset("benchmark/random", root=root)
-    if options.root is None and config.use_images:
-        random_embeddings(root, len(dataset), config.clip.model, config.network.clip_dim)
     policy = LanSARPolicy(config, dataset_meta=dataset.meta).to(options.device).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
-    optimizer = config.get_optimizer_preset().build(policy.parameters())
+    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
     loader = torch.utils.data.DataLoader(dataset, options.batch_size, shuffle=True, drop_last=True)
     if len(loader) == 0:
         raise ValueError(
             f"--batch_size={options.batch_size} is more than the dataset's {len(dataset)} frames."
         )
+    dtype = getattr(torch, options.dtype)
+    device_type = torch.device(options.device).type
 
-    def batches():
+    def batches() -> Iterator[Any]:
         while True:
             yield from loader
 
-    source = batches()
-    waiting, computing, steps = [], [], []
-    for _ in tqdm(range(options.updates + 2), desc="Updates", leave=False):
-        start = time.perf_counter()
-        batch = preprocess(next(source))
-        ready = time.perf_counter()
-        loss, _ = policy.forward(batch)
+    def update(batch: dict[str, Any]) -> None:
+        with torch.autocast(device_type, dtype=torch.bfloat16, enabled=options.dtype == "bfloat16"):
+            loss, _ = policy.forward(batch)
         loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 10)
         optimizer.step()
         optimizer.zero_grad()
-        loss.item()  # waits for a GPU
-        end = time.perf_counter()
+
+    source = batches()
+    waiting, computing, steps = [], [], []
+    operations = 0
+    for number in tqdm(range(options.updates + 2), desc="Updates", leave=False):
+        start = time.perf_counter()
+        batch = preprocess(next(source))
+        finished(options.device)
+        ready = time.perf_counter()
+        with FlopCounterMode(display=False) if number == 0 else contextlib.nullcontext() as counter:
+            update(batch)
+        finished(options.device)
         waiting.append(ready - start)
-        computing.append(end - ready)
+        computing.append(time.perf_counter() - ready)
         steps.append(len(batch["valid_steps"]))
-    data, update = (sum(values[2:]) / options.updates for values in (waiting, computing))
+        if counter is not None:
+            operations = counter.get_total_flops() // steps[0]
+    data, compute = (sum(values[2:]) / options.updates for values in (waiting, computing))
+    rate = operations * sum(steps[2:]) / sum(computing[2:]) / 1e12
     return {
         "preset": options.preset,
         "parameters": sum(p.numel() for p in policy.parameters()),
         "batch_size": options.batch_size,
         "valid_steps_per_window": sum(steps[2:]) / options.updates / options.batch_size,
-        "update_ms": 1000 * update,
+        "update_ms": 1000 * compute,
         "data_ms": 1000 * data,
-        "windows_per_s": options.batch_size / (data + update),
-        "waiting_share": data / (data + update),
+        "windows_per_s": options.batch_size / (data + compute),
+        "waiting_share": data / (data + compute),
+        "tflop_per_s": rate,
+        "share_of_ceiling": rate / ceiling(options.device, dtype),
+        "hours_for_30000_updates": 30_000 * (data + compute) / 3600,
     }
 
 
 @draccus.wrap()
 def main(options: Options) -> None:
+    """Measures and prints both tables."""
     torch.set_num_threads(options.threads)
+    config = load_preset(options.preset, options.device)
     with tempfile.TemporaryDirectory() as scratch:
-        root = options.root
-        if root is None:
-            root = Path(scratch) / "random"
-            random_dataset(root)
-        row = measure(options, root)
-    for name, value in row.items():
-        print(f"{name:>24}  {value if isinstance(value, str | int) else round(value, 4)}")
+        read = reading(load_preset(options.preset, "cpu"), Path(scratch))
+        row = updates(options, config, options.root or Path(scratch) / "own")
+    floor = read["bare lookup"]
+    print("| reading a sample | ms of CPU | times the floor |\n| --- | ---: | ---: |")
+    for name, value in read.items():
+        print(f"| {name} | {value:.3f} | {value / floor:.1f} |")
+    for name, number in row.items():
+        print(f"{name:>24}  {number if isinstance(number, str | int) else round(number, 4)}")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         settings = {
             k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items() if k != "output"
         }
-        options.output.write_text(json.dumps({"settings": settings, "rows": [row]}, indent=2) + "\n")
+        result = {"settings": settings, "reading_ms": read, "updates": row}
+        options.output.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

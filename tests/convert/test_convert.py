@@ -67,6 +67,7 @@ def test_the_manifest_and_the_card_say_where_the_data_come_from(calvin, tmp_path
         "start": 112,
         "end": 124,
         "task": "lift_blue_block_table",
+        "sentence": "pick up the blue block",
         "scene": "D",
     }
     assert manifest["scenes"] == {"D": {"frames": [100, 147], "block_order": ["red", "blue", "pink"]}}
