@@ -139,9 +139,8 @@ def untrained() -> Path:
     """The same network and statistics with untrained weights: one update with learning rate 0, then evaluated."""
     log = OUT / "untrained.log"
     checkpoint = train("untrained", "--steps=1", "--policy.learning_rate=0", log=log)
-    return evaluate(
-        "untrained", checkpoint, "--eval.use_async_envs=false", log=log
-    )  # leaves a core for training
+    one_core = "--eval.use_async_envs=false"  # the other one trains
+    return evaluate("untrained", checkpoint, one_core, log=log)
 
 
 def success(folder: Path) -> dict[str, dict[str, float]]:

@@ -192,7 +192,7 @@ class LanSARPolicy(PreTrainedPolicy):
         size = 1 if one_row_at_a_time(state.device) else len(state)
         with torch.autocast(state.device.type, enabled=False):  # one step is too little work to gain from it
             chunks = [
-                self._act(list(range(len(state)))[i : i + size], *(x[i : i + size] for x in inputs))
+                self._act(list(range(i, i + size)), *(x[i : i + size] for x in inputs))
                 for i in range(0, len(state), size)
             ]
         return torch.cat(chunks)

@@ -140,6 +140,8 @@ class Windows:
                 )
         self.paraphrases = config.paraphrases
         self.sentences = load_paraphrases(root) if config.paraphrases or config.contrastive_weight else {}
+        numbers = {tuple(listed): i for i, listed in enumerate(self.sentences.values())}
+        self._group = {sentence: numbers[tuple(listed)] for sentence, listed in self.sentences.items()}
         self.device = torch.device(config.device or "cpu")
         self._move_to_gpu()
 
@@ -205,10 +207,7 @@ class Windows:
         """(B,) int64, equal for commands with the same paraphrases; None where nothing asks for it."""
         if not self.sentences:
             return None
-        known = {tuple(listed): i for i, listed in enumerate(self.sentences.values())}
-        return torch.tensor(
-            [known[tuple(self.sentences[task])] if task in self.sentences else -1 for task in tasks]
-        )
+        return torch.tensor([self._group.get(task, -1) for task in tasks])
 
     def _move_to_gpu(self) -> None:
         """The arrays onto the GPU if they take at most half of what is free there: lookups then cost no transfer."""
