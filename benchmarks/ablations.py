@@ -1,7 +1,7 @@
 """Which of LanSAR's options earn their place: same demonstrations and updates, several seeds, official chains.
 
     lansar-record --scene=D --episodes=10000 --cameras='[]' --workers=2 --output_dir=data/desk_D
-    lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --videos=false \
+    lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --images=none \
         --output_dir=data/desk_D_lerobot
     python benchmarks/ablations.py --root=data/desk_D_lerobot [--variants='[recommended,euler angles]']
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]

@@ -12,6 +12,7 @@ A language window is ``[start, end)``: its end is exclusive. Recordings and scen
 
 import hashlib
 import io
+import os
 import pickle
 import zipfile
 import zlib
@@ -29,14 +30,35 @@ FPS = 30
 COLOURS = ("red", "blue", "pink")
 """The order in which every dataset written here stores the blocks."""
 
-VECTORS = {"robot_obs": 15, "scene_obs": 24, "actions": 7, "rel_actions": 7}
-"""Lengths of the float vectors stored in every frame file."""
+SCENES = ("A", "B", "C", "D")
+
+TASKS = (
+    *(f"rotate_{colour}_block_{side}" for colour in COLOURS for side in ("right", "left")),
+    *(f"push_{colour}_block_{side}" for colour in COLOURS for side in ("right", "left")),
+    *("move_slider_left", "move_slider_right", "open_drawer", "close_drawer"),
+    *(f"lift_{colour}_block_{place}" for colour in COLOURS for place in ("table", "slider", "drawer")),
+    *("place_in_slider", "place_in_drawer", "stack_block", "unstack_block"),
+    *("turn_on_lightbulb", "turn_off_lightbulb", "turn_on_led", "turn_off_led", "push_into_drawer"),
+)
+"""CALVIN's 34 tasks; a task's number in a dataset is its place here."""
+
+VECTORS = {"robot_obs": (15,), "scene_obs": (24,), "actions": (7,), "rel_actions": (7,)}
+"""Shapes of the float vectors stored in every frame file."""
 
 CAMERAS = {"rgb_static": (200, 200, 3), "rgb_gripper": (84, 84, 3)}
 """Shapes of the uint8 pictures stored in a frame file, unless it was recorded without cameras."""
 
+DEPTH = {"depth_static": (200, 200), "depth_gripper": (84, 84)}
+"""Shapes of the floating-point distances (m) of both cameras, in public data."""
+
+TACTILE = {"rgb_tactile": (160, 120, 6), "depth_tactile": (160, 120, 2)}
+"""Shapes of the pictures of the two fingertip sensors side by side: uint8 colours, floating-point depth."""
+
+_SHAPES = VECTORS | CAMERAS | DEPTH | TACTILE
+
 _REPAIR = "download or record it again"
-_NO_PICTURES = "recorded without cameras? then use --videos=false and no --embed"
+_NO_PICTURES = "recorded without cameras? then use --images=none and no --embed"
+_NO_EXTRA = "not recorded? then leave out --depth and --tactile"
 
 
 def _encode_latin1(text: str, encoding: str) -> bytes:
@@ -121,9 +143,12 @@ class CalvinSplit:
     """The index of one split, read and checked once; frames are read on demand.
 
     Attributes:
+        root: the dataset's folder.
+        name: the split's name.
         folder: the split's folder.
         scenes: scene letter -> (first, last) frame, both inclusive.
         windows: the annotated windows in the file's order.
+        recordings: (N, 2) first and last frame of each uninterrupted recording, in order.
         source_sha256: hash of the index files, which identifies what was converted.
 
     Raises:
@@ -132,6 +157,7 @@ class CalvinSplit:
     """
 
     def __init__(self, root: Path, split: str):
+        self.root, self.name = root, split
         self.folder = root / split
         if not self.folder.is_dir():
             found = sorted(p.parent.name for p in root.glob("*/lang_annotations"))
@@ -155,15 +181,19 @@ class CalvinSplit:
         """The file of one frame, whether or not it exists."""
         return self.folder / f"episode_{frame:07d}.npz"
 
+    def frames(self) -> np.ndarray:
+        """The numbers of all frame files there are, sorted, (n,) int64."""
+        return frame_numbers(self.folder)
+
     def read(self, frames: Iterable[int], keys: Iterable[str]) -> dict[str, np.ndarray]:
         """Reads some arrays of some frames.
 
         Args:
             frames: n frame numbers.
-            keys: names out of :data:`VECTORS` and :data:`CAMERAS`.
+            keys: names out of :data:`VECTORS`, :data:`CAMERAS`, :data:`DEPTH` and :data:`TACTILE`.
 
         Returns:
-            For each key an array of shape (n, length) in the file's floating dtype, or (n, H, W, 3) uint8.
+            For each key an array of shape (n, …) in the file's floating dtype, or uint8 for colours.
 
         Raises:
             FileNotFoundError: a frame's file is missing.
@@ -178,6 +208,13 @@ class CalvinSplit:
         return {key: np.stack(column) for key, column in columns.items()}
 
 
+def frame_numbers(folder: Path) -> np.ndarray:
+    """The numbers of the frame files in a split's folder, sorted, (n,) int64."""
+    names = (entry.name for entry in os.scandir(folder))
+    numbers = [name[8:-4] for name in names if name.startswith("episode_") and name.endswith(".npz")]
+    return np.sort(np.array([number for number in numbers if number.isdecimal()], dtype=np.int64))
+
+
 def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as stored:
@@ -189,7 +226,7 @@ def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
         raise FileNotFoundError(f"{path} is missing: the split is incomplete, {_REPAIR}") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path}: truncated or not an npz file ({error}); {_REPAIR}") from error
-    remedy = _NO_PICTURES if missing[0] in CAMERAS else _REPAIR
+    remedy = _NO_PICTURES if missing[0] in CAMERAS else _REPAIR if missing[0] in VECTORS else _NO_EXTRA
     raise ValueError(f"{path}: array {missing[0]!r} is missing; {remedy}")
 
 
@@ -210,10 +247,10 @@ def _npy_header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def _checked(array: np.ndarray, key: str, path: Path) -> np.ndarray:
-    shape = (VECTORS[key],) if key in VECTORS else CAMERAS[key]
-    is_right_kind = array.dtype.kind == "f" if key in VECTORS else array.dtype == np.uint8
+    shape, is_colour = _SHAPES[key], key.startswith("rgb_")
+    is_right_kind = array.dtype == np.uint8 if is_colour else array.dtype.kind == "f"
     if array.shape != shape or not is_right_kind:
-        wanted = f"{'float' if key in VECTORS else 'uint8'} {shape}"
+        wanted = f"{'uint8' if is_colour else 'float'} {shape}"
         raise ValueError(f"{path}: array {key!r} is {array.dtype} {array.shape}, expected {wanted}")
     return array
 

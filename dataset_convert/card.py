@@ -1,80 +1,171 @@
 """The dataset's card (README.md), also used on the Hugging Face hub."""
 
+import json
+from collections import Counter
+from pathlib import Path
 from typing import Any
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
 
+_MEANING = {
+    "observation.state": "`robot_obs`: TCP pose (m, rad), gripper width (m), 7 joints (rad), gripper action",
+    "observation.environment_state": "`scene_obs`: slider, drawer, button, switch, bulb, LED; red, blue, pink block",
+    "calvin.actions": f"the same action in absolute form: {_ABS}",
+    "calvin.rel_actions": f"the same action in relative form: {_REL}",
+    "calvin.frame": "frame number in the source",
+    "calvin.window": "annotated window that the frame belongs to (its place in the language file), −1 for none",
+    "calvin.task": "CALVIN task, a place in `task_names` of `meta/calvin_source.json`, −1 for none",
+    "calvin.scene": "scene, a place in `scene_names` of `meta/calvin_source.json`",
+    "observation.images.static": "fixed camera",
+    "observation.images.gripper": "camera in the hand",
+    "observation.images.static_depth": "distances (m) of the fixed camera",
+    "observation.images.gripper_depth": "distances (m) of the camera in the hand",
+}
 
-def describe(manifest: dict[str, Any], repo_id: str) -> str:
+
+def write(root: Path, repo_id: str) -> None:
+    """Writes README.md."""
+    from lerobot.datasets.io_utils import load_info
+    from lerobot.datasets.utils import create_lerobot_dataset_card
+
+    card = create_lerobot_dataset_card(dataset_info=load_info(root), repo_id=repo_id, **fields(root, repo_id))
+    card.save(root / "README.md")
+
+
+def fields(root: Path, repo_id: str) -> dict[str, Any]:
+    """What LeRobot's card is told of a converted dataset."""
+    manifest = json.loads((root / "meta" / "calvin_source.json").read_text())
+    info = json.loads((root / "meta" / "info.json").read_text())
+    clip = root / "clip" / "clip.json"
+    return {
+        "tags": ["calvin", "language-conditioned"],
+        "license": manifest["license"] or None,
+        "dataset_description": describe(
+            manifest, info, json.loads(clip.read_text()) if clip.exists() else None, repo_id
+        ),
+        "url": "http://calvin.cs.uni-freiburg.de",
+        "paper": "https://arxiv.org/abs/2112.03227",
+    }
+
+
+def describe(
+    manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any] | None, repo_id: str
+) -> str:
     """The description part of the card.
 
     Args:
         manifest: what ``meta/calvin_source.json`` holds.
+        info: what ``meta/info.json`` holds.
+        clip: what ``clip/clip.json`` holds, if there are embeddings.
         repo_id: the dataset's name.
 
     Returns:
         Markdown.
     """
     request = manifest["request"]
-    action, other = (_REL, "calvin.actions") if request["action"] == "rel" else (_ABS, "calvin.rel_actions")
-    rows = [
-        (
-            "observation.state",
-            "15",
-            "`robot_obs`: TCP pose, gripper width (m), 7 joints (rad), gripper action",
-        ),
-        (
-            "observation.environment_state",
-            "24",
-            "`scene_obs`: slider, drawer, button, switch, bulb, LED, blocks",
-        ),
-        ("action", "7", action),
-        (other, "7", "the same action in the other form"),
-        ("calvin.frame", "1", "frame number in the source"),
-    ]
-    if request["videos"]:
-        rows.append(("observation.images.static", "200×200×3", "video of the fixed camera"))
-        rows.append(("observation.images.gripper", "84×84×3", "video of the gripper camera"))
-    if request["clip"]:
-        model = f"{request['clip']['model']} {request['clip']['pretrained']}".strip()
-        rows.append(("clip/*.npy", "", f"CLIP embeddings ({model}) of the pictures, by absolute `index`"))
-    features = "\n".join(f"| `{key}` | {shape} | {text} |" for key, shape, text in rows)
+    used = [manifest["windows"][number] for episode in manifest["episodes"] for number in episode["windows"]]
+    counts = Counter(window["task"] for window in used)
+    tasks = "\n".join(f"| {task} | {counts[task]} |" for task in manifest["task_names"] if counts[task])
     scenes = "; ".join(
         f"{letter} (in the source's order {', '.join(scene['block_order'])})"
         for letter, scene in manifest["scenes"].items()
     )
-    tasks = sorted({episode["task"] for episode in manifest["episodes"]})
-    version = manifest["versions"]["lerobot_policy_lansar"]
-    train, evaluate = "", ""
-    if request["clip"]:
-        clip = request["clip"]
-        train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"
-    else:
-        train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
-    return f"""Demonstrations on the CALVIN desk (Mees et al., 2022), one per annotated window, 30 fps.
+    episode = (
+        "one per annotated window"
+        if request["mode"] == "windows"
+        else "one per uninterrupted recording of play, in which the annotated windows give a frame its task"
+    )
+    hours = info["total_frames"] / info["fps"] / 3600
+    return f"""Demonstrations on the CALVIN desk (Mees et al., 2022): {info["total_episodes"]} episodes, {episode};
+{info["total_frames"]} frames ({hours:.1f} hours) at {info["fps"]} Hz, {info["total_tasks"]} different commands.
 
-| feature | shape | content |
-| --- | --- | --- |
-{features}
+| feature | shape | stored as | content |
+| --- | --- | --- | --- |
+{_features(info, request["action"])}
 
 * **Source:** split `{request["split"]}` of `{request["source"]}`, SHA-256 of its index files
-  `{request["source_sha256"]}`, converted with lerobot_policy_lansar
-  {version}. Every frame was checked. Window ends are
-  exclusive, as in CALVIN; windows of the public data are random cuts that overlap.
+  `{request["source_sha256"]}`, converted with lerobot_policy_lansar {manifest["versions"]["lerobot_policy_lansar"]}.
+  Every frame was checked: finite, of the right shape and type, relative actions equal to what absolute actions and
+  states imply, no frame missing. `meta/calvin_source.json` has a SHA-256 of every episode's source frames and of every
+  file; `lansar-verify` compares this dataset with its source.
+* **Windows** end before their last number, as in CALVIN.{_windows(manifest, used)}
 * **Scenes:** {scenes}. Blocks are always red, blue, pink here.
-* **Episodes:** {len(manifest["episodes"])}, of {len(tasks)} tasks: {", ".join(tasks)}.
-  `meta/calvin_source.json` names each episode's window and task.
+* **Left out:** {_left_out(manifest)}
 * **Privileged state:** `observation.environment_state` is the simulator's own state (block poses, joints,
   lights). A real robot does not have it; results of policies that read it must say so.
+{_clip(clip)}
+| task | windows |
+| --- | ---: |
+{tasks}
 
-Train and evaluate with LeRobot, the plugin lerobot_policy_lansar installed beside it:
+### Train and evaluate
 
-    lerobot-train --policy.type=lansar{train} --dataset.repo_id={repo_id} \\
-        --output_dir=outputs/train
+With LeRobot and the plugin lerobot_policy_lansar installed beside it:
+
+{_commands(request, clip, repo_id)}
+"""
+
+
+def _features(info: dict[str, Any], action: str) -> str:
+    rows = []
+    for key, feature in info["features"].items():
+        if not key.startswith(("observation.", "action", "calvin.")):
+            continue
+        shape = "×".join(str(size) for size in feature["shape"])
+        text = (
+            (_REL if action == "rel" else _ABS) if key == "action" else _MEANING.get(key, "fingertip sensor")
+        )
+        rows.append(f"| `{key}` | {shape} | {feature['dtype']} | {text} |")
+    return "\n".join(rows)
+
+
+def _windows(manifest: dict[str, Any], used: list[dict[str, Any]]) -> str:
+    request = manifest["request"]
+    kept = (
+        ""
+        if len(used) == len(manifest["windows"])
+        else f" {len(used)} of {len(manifest['windows'])} are here."
+    )
+    if request["mode"] == "play":
+        return f"{kept} Every frame of play is here once."
+    if request["dedup"] == "none":
+        return f"{kept} Windows may overlap: in the public data they are random cuts around a solved task."
+    what = "of one task " if request["dedup"] == "task" else ""
+    return f"{kept} No two windows {what}share a frame (`--dedup={request['dedup']}`)."
+
+
+def _left_out(manifest: dict[str, Any]) -> str:
+    text = (
+        f"{len(manifest['left_out'])} defective episodes."
+        if manifest["left_out"]
+        else "no defective episode."
+    )
+    if manifest["shared_frames"]:
+        what = "were left out" if manifest["request"]["exclude_shared"] else "are still here"
+        frames = ", ".join(str(frame) for frame in manifest["shared_frames"][:10])
+        text += f" Frames that training and validation share {what}: {frames}."
+    return text
+
+
+def _clip(clip: dict[str, Any] | None) -> str:
+    if clip is None:
+        return ""
+    return (
+        f"* **CLIP embeddings** of both cameras' pictures: `clip/*.npy`, float16 by absolute `index`, of open_clip's\n"
+        f"  {clip['model']} {clip['pretrained'] or 'untrained'}, SHA-256 of its weights `{clip['weights_sha256']}`.\n"
+    )
+
+
+def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
+    train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
+    if clip is not None:
+        train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"
+        evaluate = ""
+    return f"""    lerobot-train --policy.type=lansar{train} --policy.push_to_hub=false \\
+        --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
         --env.control_mode=abs{evaluate}
 
 LanSAR emits absolute poses by default; a policy that emits what `action` holds is evaluated with
-`--env.control_mode={request["action"]}`.
-"""
+`--env.control_mode={request["action"]}`."""

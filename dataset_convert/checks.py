@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_convert.calvin import COLOURS, CalvinSplit, Window
+from dataset_convert.calvin import COLOURS, CalvinSplit
 
 POSITION_STEP = 0.02
 """Metres that a relative action of 1 stands for."""
@@ -54,12 +54,12 @@ def relative_actions(actions: np.ndarray, robot_obs: np.ndarray) -> np.ndarray:
     return np.concatenate([np.clip(position, -1, 1), np.clip(rotation, -1, 1), actions[:, 6:]], axis=1)
 
 
-def check_window(columns: dict[str, np.ndarray], window: Window, split: CalvinSplit) -> None:
-    """Checks every frame of one window; shapes and dtypes were checked when it was read.
+def check_frames(columns: dict[str, np.ndarray], frames: range, split: CalvinSplit) -> None:
+    """Checks consecutive frames; shapes and dtypes were checked when they were read.
 
     Args:
-        columns: the window's vectors, each (n, length).
-        window: where they come from.
+        columns: the frames' vectors and, if any, distances, each (n, …); colours are left alone.
+        frames: their n numbers.
         split: names the files.
 
     Raises:
@@ -68,10 +68,12 @@ def check_window(columns: dict[str, np.ndarray], window: Window, split: CalvinSp
     """
 
     def file_of(row: np.integer) -> Path:
-        return split.frame_file(window.start + int(row))
+        return split.frame_file(frames[int(row)])
 
     for key, column in columns.items():
-        bad = ~np.isfinite(column).all(axis=1)
+        if column.dtype == np.uint8:
+            continue
+        bad = ~np.isfinite(column.reshape(len(column), -1)).all(axis=1)
         if bad.any():
             raise ValueError(f"{file_of(bad.argmax())}: array {key!r} holds a number that is not finite")
     gripper = columns["actions"][:, 6]

@@ -1,36 +1,41 @@
 """``lansar-convert``: a split of a CALVIN dataset becomes a LeRobotDataset v3."""
 
 import json
-import multiprocessing
 import os
-import signal
+import shlex
+import shutil
+import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from dataclasses import dataclass, field
-from importlib.metadata import version
+from bisect import bisect_left
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import draccus
-import numpy as np
 from draccus.utils import DraccusException
-from tqdm import tqdm
 
-from dataset_convert import checks
-from dataset_convert.calvin import CAMERAS, VECTORS, CalvinSplit
-from dataset_convert.card import describe
-from dataset_convert.publish import publishing
+from dataset_convert import checks, publish
+from dataset_convert.calvin import CAMERAS, SCENES, TASKS, VECTORS, CalvinSplit
+from dataset_convert.episodes import (
+    DEDUP,
+    MODES,
+    NO_COMMAND,
+    Span,
+    as_ranges,
+    missing_frames,
+    play_spans,
+    shared_frames,
+    window_of_frames,
+    window_spans,
+)
+from dataset_convert.shards import Job, convert_shard, cut_into_shards, describe, frames_done
+from dataset_convert.writer import RGBEncoder
+from lerobot_lansar.executors import SlurmConfig, WorkerDied, check_executor, run_shards
 
-if TYPE_CHECKING:  # importing LeRobot takes seconds: a mistyped option is reported before that
-    from dataset_convert.writer import Episode
+FRAMES_PER_SHARD = 8000
+"""One parquet file and one mp4 per camera (about 30 MB) hold this many frames."""
 
-EPISODES_PER_SHARD = 200
-"""One parquet file and one mp4 per camera (about 30 MB) hold this many episodes."""
-
-MANIFEST = Path("meta") / "calvin_source.json"
+IMAGES = ("video", "png", "none")
 
 
 @dataclass
@@ -45,282 +50,334 @@ class ClipOptions:
 
 @dataclass
 class ConvertConfig:
-    """Converts the language-annotated windows of a CALVIN split to a LeRobotDataset v3 at 30 fps."""
+    """Converts a split of a CALVIN dataset to a LeRobotDataset v3 at 30 fps."""
 
     # folder of the CALVIN dataset, the one that holds training/ and validation/
     root: Path
     # name of the dataset, you/name; also its place on the hub
     repo_id: str
-    # folder to create
-    output_dir: Path
+    # folder to create; by default where LeRobot looks for a dataset of that name
+    output_dir: Path | None = None
     # which split to convert
     split: str = "training"
+    # windows: an episode is an annotated window; play: an uninterrupted recording, windows are annotations in it
+    mode: str = "windows"
+    # windows to leave out because they overlap: none, those of one task (task), or all (frames)
+    dedup: str = "none"
+    # training: leave out what contains frames that are in validation too
+    exclude_shared: bool = False
+    # leave defective episodes out, and say so, instead of stopping
+    skip_bad: bool = False
     # what `action` holds: rel (relative) or abs (absolute); the other form is kept in another column
     action: str = "rel"
-    # store both cameras as videos
-    videos: bool = True
-    # codec of the videos, as LeRobot names them
-    vcodec: str = "libsvtav1"
+    # both cameras as video, as png in the parquet files, or none
+    images: str = "video"
+    # store the cameras' distances too
+    depth: bool = False
+    # store the fingertip sensors' pictures too
+    tactile: bool = False
+    rgb_encoder: RGBEncoder = field(default_factory=RGBEncoder)
     # compute CLIP embeddings of the pictures and store them beside the data
     embed: bool = False
     clip: ClipOptions = field(default_factory=ClipOptions)
     # processes that convert in parallel
     workers: int = 1
+    # where they run: local, slurm or ray
+    executor: str = "local"
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+    # of the data, a word that the hub knows, for the card; CALVIN's is mit
+    license: str = "mit"
     # upload to the hub when done
     push_to_hub: bool = False
     # make the uploaded dataset private
     private: bool = False
 
+    @property
+    def target(self) -> Path:
+        """The folder to create."""
+        return folder_of(self.repo_id, self.output_dir)
 
-@dataclass
-class _Job:
-    """What every shard needs; sent to each worker once."""
+    def check(self) -> None:
+        """Raises ValueError at an option that cannot be."""
+        for name, choices in (
+            ("action", ("rel", "abs")),
+            ("mode", MODES),
+            ("dedup", DEDUP),
+            ("images", IMAGES),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"--{name}={getattr(self, name)}: expected {' or '.join(choices)}")
+        if self.mode == "play" and self.dedup != "none":
+            raise ValueError("--dedup is for --mode=windows: in play every frame occurs once")
+        if self.images == "none" and (self.depth or self.tactile):
+            raise ValueError("--images=none: then there is neither --depth nor --tactile")
+        if self.exclude_shared and self.split != "training":
+            raise ValueError(f"--exclude_shared is for --split=training, not {self.split}")
+        if self.workers < 1:
+            raise ValueError(f"--workers={self.workers}: expected 1 or more")
+        if self.push_to_hub and self.repo_id.count("/") != 1:
+            raise ValueError(f"--repo_id={self.repo_id}: expected user/name to push to the hub")
+        check_executor(self.executor, self.slurm)
 
-    split: CalvinSplit
-    root: Path
-    info: Any
-    action: str
-    cameras: list[str]
-    vcodec: str
-    encoder_threads: int | None
-    block_orders: dict[str, tuple[str, ...]]
-    task_index: dict[str, int]
-
-    def episodes(self, first: int, count: int, on_episode: Callable[[], object]) -> "Iterator[Episode]":
-        """Reads and checks the windows of one shard, one at a time."""
-        from dataset_convert.writer import IMAGE_KEYS, Episode
-
-        for window in self.split.windows[first : first + count]:
-            read = self.split.read(range(window.start, window.end), [*VECTORS, *self.cameras])
-            checks.check_window({key: read[key] for key in VECTORS}, window, self.split)
-            main, other = ("rel_actions", "actions") if self.action == "rel" else ("actions", "rel_actions")
-            columns = {
-                "observation.state": read["robot_obs"],
-                "observation.environment_state": checks.reorder_blocks(
-                    read["scene_obs"], self.block_orders[window.scene]
-                ),
-                "action": read[main],
-                f"calvin.{other}": read[other],
-            }
-            columns = {key: column.astype(np.float32) for key, column in columns.items()}
-            columns["calvin.frame"] = np.arange(window.start, window.end)
-            images = {IMAGE_KEYS[camera]: read[camera] for camera in self.cameras}
-            yield Episode(window.sentence, columns, images)
-            on_episode()
-
-    def write(self, shard: int, on_episode: Callable[[], object]) -> dict:
-        """Writes one shard; returns its statistics."""
-        from dataset_convert.writer import Place, write_shard
-
-        first = shard * EPISODES_PER_SHARD
-        place = Place(shard, first, sum(len(window) for window in self.split.windows[:first]))
-        episodes = self.episodes(first, EPISODES_PER_SHARD, on_episode)
-        return write_shard(
-            self.root, self.info, place, episodes, self.task_index, self.vcodec, self.encoder_threads
+    def request(self, split: CalvinSplit) -> dict[str, Any]:
+        """Everything that decides the dataset's frames."""
+        names = (
+            "split",
+            "mode",
+            "dedup",
+            "exclude_shared",
+            "skip_bad",
+            "action",
+            "images",
+            "depth",
+            "tactile",
         )
+        encoder = asdict(self.rgb_encoder) if self.images == "video" else None
+        return {
+            "source": self.root.resolve().name,
+            "source_sha256": split.source_sha256,
+            **{name: getattr(self, name) for name in names},
+            "rgb_encoder": encoder,
+        }
+
+
+def folder_of(repo_id: str, folder: Path | None) -> Path:
+    """A dataset's folder: the one given, or where LeRobot looks for a dataset of that name."""
+    if folder is not None:
+        return folder
+    from huggingface_hub.constants import HF_HOME
+
+    return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")) / repo_id
+
+
+class HubError(Exception):
+    """The upload failed; the dataset is safe on disk."""
 
 
 def convert(config: ConvertConfig) -> Path:
-    """Converts a split; the dataset appears at ``output_dir`` complete or not at all.
+    """Converts a split; the dataset appears at ``config.target`` complete or not at all.
+
+    What is there of an interrupted conversion is used; what is finished is not done again.
 
     Args:
         config: the command's options.
 
     Returns:
-        The dataset's folder. If it already holds the result of the same request, nothing is done.
+        The dataset's folder. With ``executor="slurm"`` it appears when the jobs are done.
 
     Raises:
-        FileNotFoundError: a file of the source is missing.
-        ValueError: an option or the source's content is wrong, or ``output_dir`` holds something else.
+        FileNotFoundError: files of the source are missing.
+        ValueError: an option or the source's content is wrong, or the target holds something else.
+        WorkerDied: a worker was killed; the same call goes on where it stopped.
+        HubError: the upload failed.
     """
-    _check_options(config)
+    config.check()
+    config = replace(config, root=config.root.resolve(), output_dir=config.target.resolve())
     split = CalvinSplit(config.root, config.split)
-    clip = {"model": config.clip.model, "pretrained": Path(config.clip.pretrained).name}
-    request = {
-        "source": config.root.resolve().name,
-        "split": config.split,
-        "source_sha256": split.source_sha256,
-        "action": config.action,
-        "videos": config.videos,
-        "vcodec": config.vcodec if config.videos else None,
-        "clip": clip if config.embed else None,
-    }
-    if _is_done(config.output_dir, request):
-        print(f"{config.output_dir} already holds this conversion", file=sys.stderr)
-        return config.output_dir
-    cameras = list(CAMERAS) if config.videos else []
-    # Before the long part, so that a folder without pictures is reported at once.
-    split.read([split.windows[0].start], [*VECTORS, *(CAMERAS if config.embed else cameras)])
-    scenes = sorted({window.scene for window in split.windows})
-    orders = {scene: checks.block_order(scene, checks.block_votes(split, scene)) for scene in scenes}
+    request = config.request(split)
+    if _is_done(config.target, request):
+        print(f"{config.target} already holds this conversion", file=sys.stderr)
+        _after(config, split)
+        return config.target
+    arrays = [*VECTORS, *(CAMERAS if config.embed else ())]
+    job, info, report = plan(config, split)
+    split.read(
+        [job.spans[0].start], dict.fromkeys([*arrays, *job.arrays()])
+    )  # what was not recorded is reported at once
+    if config.embed:
+        from dataset_convert import embed
+
+        embed.load_clip(config.clip.model, config.clip.pretrained)
+    with publish.staging(config.target, request) as folder:
+        if config.executor == "slurm":
+            publish.mark_submitted(folder)
+        run_shards(
+            (convert_shard, (job,)),
+            len(job.shards),
+            (conclude, (config, job, info, request, report)),
+            executor=config.executor,
+            workers=min(config.workers, len(job.shards)),
+            slurm=config.slurm,
+            logging_dir=_logs(config, folder),
+            progress=lambda: frames_done(folder),
+            total=sum(len(span) for span in job.spans),
+            unit="frame",
+            desc="converting",
+        )
+    return config.target
+
+
+def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str, Any]]:
+    """Decides which episodes there will be and in which shards; prints what is remarkable of the source.
+
+    Returns:
+        The work, LeRobot's description of the dataset, and what to report in the manifest.
+
+    Raises:
+        FileNotFoundError: frames are missing and ``skip_bad`` is off.
+        ValueError: the blocks' order is unclear, or nothing is left to convert.
+    """
+    shared = shared_frames(split) if config.split == "training" else []
+    if shared:
+        what = "left out" if config.exclude_shared else "kept; --exclude_shared=true leaves them out"
+        _say(f"frames {as_ranges(shared)} are in training and in validation: {what}")
+    excluded = shared if config.exclude_shared else []
+    if config.mode == "play":
+        spans = play_spans(split, excluded)
+    else:
+        spans = window_spans(split.windows, config.dedup, excluded)
+    spans, left_out = _without_missing(config, split, spans)
+    if not spans:
+        raise ValueError(f"{split.folder}: no episode is left to convert")
+    inside = sum(len(span.windows) for span in spans)
+    if inside < len(split.windows):
+        _say(f"{len(split.windows) - inside} of {len(split.windows)} annotated windows are left out")
+    scenes = sorted({span.scene for span in spans})
+    votes = {scene: checks.block_votes(split, scene) for scene in scenes}
+    orders = {scene: checks.block_order(scene, votes[scene]) for scene in scenes}
     for scene, order in orders.items():
         if order != checks.SCENE_BLOCK_ORDER.get(scene):
-            print(f"scene {scene}: block columns are {', '.join(order)}, as its lifts show", file=sys.stderr)
-    tasks = list(dict.fromkeys(window.sentence for window in split.windows))
+            _say(f"scene {scene}: block columns are {', '.join(order)}, as its lifts show")
+    names = {window.task for window in split.windows}
 
-    from dataset_convert import embed, writer
+    from dataset_convert import features
 
-    clip_model = embed.load_clip(config.clip.model, config.clip.pretrained) if config.embed else None
-    writer.check_codec(config.vcodec)
-    info = writer.empty_info(config.action, config.videos)
-    with publishing(config.output_dir) as root:
-        job = _Job(
-            split=split,
-            root=root,
-            info=info,
-            action=config.action,
-            cameras=cameras,
-            vcodec=config.vcodec,
-            encoder_threads=1 if config.workers > 1 else None,
-            block_orders=orders,
-            task_index={sentence: number for number, sentence in enumerate(tasks)},
+    pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder)
+    info = features.empty_info(config.action, pictures)
+    job = Job(
+        split=split,
+        folder=publish.staging_of(config.target),
+        spans=spans,
+        shards=cut_into_shards([len(span) for span in spans], FRAMES_PER_SHARD),
+        layout=features.layout_of(info, pictures),
+        action=config.action,
+        block_orders=orders,
+        tasks=_sentences(split, spans),
+        task_names=[*TASKS, *sorted(names - set(TASKS))],
+        scene_names=[*SCENES, *sorted(set(scenes) - set(SCENES))],
+        skip_bad=config.skip_bad,
+    )
+    report = {
+        "license": config.license,
+        "shared_frames": shared,
+        "block_votes": {scene: votes[scene].tolist() for scene in scenes},
+        "left_out": left_out,
+    }
+    return job, info, report
+
+
+def _without_missing(
+    config: ConvertConfig, split: CalvinSplit, spans: list[Span]
+) -> tuple[list[Span], list[dict[str, Any]]]:
+    missing = missing_frames(spans, split.frames())
+    if not missing:
+        return spans, []
+    if not config.skip_bad:
+        raise FileNotFoundError(
+            f"{split.frame_file(missing[0])} is missing, {len(missing)} frames in all: {as_ranges(missing)}; download "
+            "or record them again, or leave their episodes out with --skip_bad=true"
         )
-        stats = _run(job, config.workers)
-        lengths = [len(window) for window in split.windows]
-        writer.write_whole(root, info, tasks, lengths, stats, config.vcodec)
-        manifest = {
-            "request": request,
-            "scenes": {
-                scene: {"frames": list(split.scenes[scene]), "block_order": list(order)}
-                for scene, order in orders.items()
-            },
-            "versions": {name: version(name) for name in ("lerobot_policy_lansar", "lerobot", "numpy", "av")},
-            "episodes": [
-                {"start": w.start, "end": w.end, "task": w.task, "sentence": w.sentence, "scene": w.scene}
-                for w in split.windows
-            ],
-        }
-        (root / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
-        if clip_model is not None:
-            frames = np.concatenate([np.arange(window.start, window.end) for window in split.windows])
-            embed.embed_frames(root, split, frames, clip_model, clip)
-        _card(info, manifest, config.repo_id).save(root / "README.md")
-    return config.output_dir
+    kept, left_out = [], []
+    for span in spans:
+        lost = missing[bisect_left(missing, span.start) : bisect_left(missing, span.end)]
+        if lost:
+            left_out.append({**describe(span), "reason": f"frames are missing: {as_ranges(lost)}"})
+        else:
+            kept.append(span)
+    return kept, left_out
 
 
-def _check_options(config: ConvertConfig) -> None:
-    if config.action not in ("rel", "abs"):
-        raise ValueError(f"--action={config.action}: expected rel or abs")
-    if config.workers < 1:
-        raise ValueError(f"--workers={config.workers}: expected 1 or more")
-    if config.push_to_hub and config.repo_id.count("/") != 1:
-        raise ValueError(f"--repo_id={config.repo_id}: expected user/name to push to the hub")
+def _sentences(split: CalvinSplit, spans: list[Span]) -> list[str]:
+    """The distinct commands in the order in which they first occur."""
+    found: dict[str, None] = {}
+    for span in spans:
+        numbers = dict.fromkeys(window_of_frames(span, split.windows).tolist())
+        found |= dict.fromkeys(split.windows[n].sentence if n >= 0 else NO_COMMAND for n in numbers)
+    return list(found)
 
 
-def _is_done(output_dir: Path, request: dict[str, Any]) -> bool:
-    if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
+def conclude(
+    config: ConvertConfig, job: Job, info: Any, request: dict[str, Any], report: dict[str, Any], _: int
+) -> None:
+    """The step after all shards: one dataset of them, in its place; then its embeddings and the upload."""
+    from dataset_convert import card, finish
+
+    manifest = finish.finish(job, info, config.rgb_encoder, request, report)
+    card.write(job.dataset, config.repo_id)
+    publish.publish(job.folder, config.target)
+    for bad in manifest["left_out"][:20]:
+        _say(f"left out: frames {bad['start']}-{bad['end'] - 1}: {bad['reason']}")
+    if manifest["left_out"]:
+        _say(f"{len(manifest['left_out'])} defective episodes were left out; {finish.MANIFEST} lists them")
+    _after(config, job.split)
+
+
+def _after(config: ConvertConfig, split: CalvinSplit) -> None:
+    if config.embed:
+        from dataset_convert import card, embed
+
+        clip = embed.load_clip(config.clip.model, config.clip.pretrained)
+        pictures = embed.SourcePictures(split, config.target)
+        embed.embed(config.target, pictures, clip, config.clip, num_workers=config.workers - 1)
+        card.write(config.target, config.repo_id)
+    if config.push_to_hub:
+        from dataset_convert import hub
+
+        try:
+            hub.push(config.target, config.repo_id, config.private)
+        except Exception as error:  # the network's errors are of many kinds
+            raise HubError(
+                f"cannot upload {config.target}: {error}; the dataset is complete there, run this again to go on"
+            ) from error
+
+
+def _is_done(target: Path, request: dict[str, Any]) -> bool:
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return False
-    manifest = output_dir / MANIFEST
+    manifest = target / "meta" / "calvin_source.json"
     if manifest.is_file() and json.loads(manifest.read_text())["request"] == request:
         return True
     what = "the result of another conversion" if manifest.is_file() else "something else"
-    raise ValueError(f"--output_dir={output_dir} holds {what}: remove it or choose another folder")
+    raise ValueError(f"--output_dir={target} holds {what}: remove it or choose another folder")
 
 
-def _run(job: _Job, workers: int) -> list[dict]:
-    """Writes all shards, with a progress bar over episodes; returns their statistics in order."""
-    total = len(job.split.windows)
-    shards = range(-(-total // EPISODES_PER_SHARD))
-    with tqdm(total=total, desc="converting", unit="episode") as bar:
-        if workers == 1:
-            return [job.write(shard, bar.update) for shard in shards]
-        # Forked workers need not import LeRobot again (20 s and 0.5 GB each).
-        methods = multiprocessing.get_all_start_methods()
-        context = multiprocessing.get_context("fork" if "fork" in methods else "spawn")
-        done, stop = context.Value("q", 0), context.Event()
-        with ProcessPoolExecutor(workers, context, _start_worker, (job, done, stop, os.getpid())) as pool:
-            futures = [pool.submit(_write_in_worker, shard) for shard in shards]
-            try:
-                while wait(futures, timeout=0.5, return_when=FIRST_EXCEPTION).not_done:
-                    bar.update(done.value - bar.n)
-                    for future in futures:
-                        if future.done():
-                            future.result()
-                bar.update(done.value - bar.n)
-                return [future.result() for future in futures]
-            except BaseException:
-                stop.set()
-                pool.shutdown(cancel_futures=True)  # nobody writes while the folder is removed
-                raise
+def _logs(config: ConvertConfig, folder: Path) -> Path:
+    """datatrove's. Those of Slurm jobs outlive the staging folder, the others say nothing that matters."""
+    if config.executor == "slurm":
+        return config.target.parent / f"{config.target.name}.slurm_logs"
+    logs = folder / "jobs"
+    shutil.rmtree(logs, ignore_errors=True)  # the shards' own notes say what is done
+    return logs
 
 
-_worker: tuple[_Job, Any, Any] | None = None
-
-
-def _start_worker(job: _Job, done: Any, stop: Any, parent: int) -> None:
-    global _worker
-    _worker = job, done, stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-
-    def follow_parent() -> None:  # a killed parent must not leave writers behind
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=follow_parent, daemon=True).start()
-
-
-def _write_in_worker(shard: int) -> dict:
-    assert _worker is not None
-    job, done, stop = _worker
-
-    def count() -> None:
-        if stop.is_set():
-            raise RuntimeError("stopped because another worker failed")
-        with done.get_lock():
-            done.value += 1
-
-    return job.write(shard, count)
-
-
-def _card(info: Any, manifest: dict[str, Any], repo_id: str) -> Any:
-    from lerobot.datasets.utils import create_lerobot_dataset_card
-
-    return create_lerobot_dataset_card(dataset_info=info, repo_id=repo_id, **_card_fields(manifest, repo_id))
-
-
-def _card_fields(manifest: dict[str, Any], repo_id: str) -> dict[str, Any]:
-    return {
-        "tags": ["calvin", "language-conditioned"],
-        "license": None,
-        "dataset_description": describe(manifest, repo_id),
-        "url": "http://calvin.cs.uni-freiburg.de",
-        "paper": "https://arxiv.org/abs/2112.03227",
-    }
-
-
-def push(config: ConvertConfig) -> None:
-    """Uploads the converted dataset with LeRobot's own method, which also sets the tag that loading needs."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    manifest = json.loads((config.output_dir / MANIFEST).read_text())
-    dataset = LeRobotDataset(config.repo_id, root=config.output_dir)
-    dataset.push_to_hub(private=config.private, **_card_fields(manifest, config.repo_id))
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 def main() -> int:
-    """Runs the command; returns 0, or 2 after an error the user can mend."""
+    """Runs the command; returns 0, 2 after an error the user can mend, or 130 after Ctrl-C."""
     os.environ.setdefault("SVT_LOG", "1")  # errors only: the encoder prints 20 lines per file otherwise
     try:
         config = draccus.parse(ConvertConfig)
-        convert(config)
-    except (OSError, ValueError, DraccusException) as error:
+        folder = convert(config)
+    except (OSError, ValueError, WorkerDied, HubError, DraccusException) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except subprocess.CalledProcessError as error:
+        print(f"error: {shlex.join(error.cmd)} failed: {error.stderr or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
-        print("stopped; nothing was left behind", file=sys.stderr)
+        print("interrupted; the same command goes on where it stopped", file=sys.stderr)
         return 130
-    if config.push_to_hub:
-        try:
-            push(config)
-        except Exception as error:  # the network's errors are of many kinds, and the dataset is safe on disk
-            print(
-                f"error: cannot upload {config.output_dir}: {error}; run this again to retry", file=sys.stderr
-            )
-            return 2
-    print(f"dataset {config.repo_id} is at {config.output_dir}")
+    if config.executor == "slurm" and not folder.exists():
+        print(f"submitted; {folder} appears when the jobs are done")
+    else:
+        print(f"dataset {config.repo_id} is at {folder}")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # workers on other machines know these functions by their module's real name
+    from dataset_convert.convert import main as run
+
+    sys.exit(run())

@@ -5,7 +5,9 @@ are remembered in the logging folder and not repeated.
 """
 
 import contextlib
+import importlib.util
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -39,6 +41,16 @@ class SlurmConfig:
     shards_per_job: int = 1
     # Further options of sbatch, for example account.
     sbatch_args: dict[str, str] = field(default_factory=dict)
+
+
+def check_executor(executor: str, slurm: SlurmConfig) -> None:
+    """Raises ValueError if an executor is unknown or cannot run here."""
+    if executor not in EXECUTORS:
+        raise ValueError(f"--executor is one of {', '.join(EXECUTORS)}, got {executor!r}")
+    if executor == "slurm" and (shutil.which("sbatch") is None or not slurm.partition):
+        raise ValueError("--executor=slurm needs Slurm's sbatch on the PATH, and --slurm.partition=NAME")
+    if executor == "ray" and importlib.util.find_spec("ray") is None:
+        raise ValueError("--executor=ray needs Ray: pip install 'lerobot_policy_lansar[ray]'")
 
 
 class Step(PipelineStep):
@@ -77,6 +89,7 @@ def run_shards(
     progress: Callable[[], int],
     total: int,
     unit: str,
+    desc: str = "recording",
 ) -> bool:
     """Calls ``work`` for every shard and ``finish`` once after them.
 
@@ -89,7 +102,7 @@ def run_shards(
         slurm: Used by the executor of that name.
         logging_dir: Where finished shards are remembered and logs are kept.
         progress: How many of ``total`` units are done, for the bar of the local executor.
-        total, unit: Of the bar.
+        total, unit, desc: Of the bar.
 
     Returns:
         Whether all is done; False when jobs were submitted that go on without this process.
@@ -122,7 +135,7 @@ def run_shards(
         if not ray.is_initialized():
             ray.init()
         remote = RayPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
-        with _watched(progress, total, unit):
+        with _watched(progress, total, unit, desc):
             remote.run()
         if missing := remote.get_incomplete_ranks(skip_completed=True):
             raise WorkerDied(
@@ -131,7 +144,7 @@ def run_shards(
     else:
         logger.disable("datatrove")
         local = LocalPipelineExecutor([steps[0]], shards, workers=workers, logging_dir=folders[0])
-        with _watched(progress, total, unit), _forks_end_with_us():
+        with _watched(progress, total, unit, desc), _forks_end_with_us():
             local.run()
     finish[0](*finish[1], 0)
     return True
@@ -187,13 +200,13 @@ os.register_at_fork(after_in_child=lambda: _end_with_parent() if _watching else 
 
 
 @contextlib.contextmanager
-def _watched(progress: Callable[[], int], total: int, unit: str) -> Iterator[None]:
+def _watched(progress: Callable[[], int], total: int, unit: str, desc: str) -> Iterator[None]:
     """A bar. A pool waits forever for a local worker that was killed: here that ends in WorkerDied."""
     ended, died = threading.Event(), threading.Event()
 
     def watch() -> None:
         known: set[int] = set()
-        with tqdm(total=total, initial=progress(), desc="recording", unit=unit) as bar:
+        with tqdm(total=total, initial=progress(), desc=desc, unit=unit) as bar:
             while not ended.wait(0.5):
                 if new := progress() - bar.n:
                     bar.update(new)

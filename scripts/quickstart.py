@@ -92,7 +92,7 @@ def record_and_convert() -> None:
             f"--root={DATA}",
             "--split=training",
             "--repo_id=lansar/quickstart",
-            "--videos=false",
+            "--images=none",
             f"--output_dir={DATA / 'lerobot'}",
         )
 

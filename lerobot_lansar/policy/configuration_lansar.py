@@ -53,7 +53,7 @@ class LanSARConfig(PreTrainedConfig):
         window_start: which windows are trained on, see `windows.py`. "episode" = from the demonstration's
             start (thesis), "anywhere" = from the sampled frame, "mixed" = half of each.
         paraphrases: in training a window's command is replaced by a random one among the dataset's sentences for
-            the same CALVIN task (meta/calvin_source.json says which task an episode shows).
+            the same CALVIN task (meta/calvin_source.json says which sentences those are).
         state_noise: in training the robot state (but not the last gripper action) is disturbed by normal noise of this
             standard deviation, in its own units, m and rad.
         contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out; those

@@ -1,9 +1,9 @@
 """All frames of one LeRobotDataset as memory-mapped arrays, ordered by LeRobot's absolute `index`.
 
 Why: reading a window of 64 steps through LeRobot's delta timestamps costs 150 ms and more, from these arrays
-0.05 ms. They are made from the dataset's parquet files at first use, kept in `<root>/.lansar_frames`, and
-made again when the dataset changed (`dataset_fingerprint`). CLIP embeddings of the pictures are not made
-here: `lansar-convert` puts them into `<root>/clip` (see `clip_dir`).
+0.05 ms. They are made from the dataset's parquet files at first use, kept in the dataset's folder (`CACHE`), and made
+again when the dataset changed (`dataset_fingerprint`). CLIP embeddings of the pictures are not made here:
+`lansar-convert` and `lansar-embed` put them into `<root>/clip` (see `clip_dir`).
 """
 
 import hashlib
@@ -17,7 +17,9 @@ import numpy as np
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-CACHE = ".lansar_frames"
+CACHE = ".cache/huggingface/lansar_frames"
+"""The hub's client never uploads what lies in this folder of a dataset."""
+
 COLUMNS = {"state": ("observation.state", 15), "environment_state": ("observation.environment_state", 24)}
 COLUMNS["action"] = ("action", 7)
 CAMERAS = {"static": "observation.images.static", "gripper": "observation.images.gripper"}
@@ -119,7 +121,7 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
 
 
 def load_frames(root: Path) -> dict[str, np.ndarray]:
-    """`read_frames` through the cache in `<root>/.lansar_frames/<fingerprint>`; memory-mapped, read-only.
+    """`read_frames` through the cache in `<root>/<CACHE>/<fingerprint>`; memory-mapped, read-only.
 
     A half-written cache is never seen: it is written beside and renamed. In a folder that cannot be written
     to the arrays are kept in memory, and read again next time.
@@ -188,17 +190,17 @@ def load_paraphrases(root: Path) -> dict[str, list[str]]:
         ValueError: the dataset does not say which task an episode shows.
     """
     file = Path(root) / "meta" / "calvin_source.json"
-    episodes = (json.loads(file.read_text()).get("episodes") if file.is_file() else None) or [{}]
-    if any(not {"task", "sentence"} <= episode.keys() for episode in episodes):
+    windows = (json.loads(file.read_text()).get("windows") if file.is_file() else None) or [{}]
+    if any(not {"task", "sentence"} <= window.keys() for window in windows):
         raise ValueError(
-            f"--policy.paraphrases and --policy.contrastive_weight need task and sentence of every episode in {file}, "
+            f"--policy.paraphrases and --policy.contrastive_weight need task and sentence of every window in {file}, "
             "as lansar-convert writes them: convert the dataset again, or train without."
         )
     by_task: dict[str, set[str]] = {}
     by_sentence: dict[str, set[str]] = {}
-    for episode in episodes:
-        by_task.setdefault(episode["task"], set()).add(episode["sentence"])
-        by_sentence.setdefault(episode["sentence"], set()).add(episode["task"])
+    for window in windows:
+        by_task.setdefault(window["task"], set()).add(window["sentence"])
+        by_sentence.setdefault(window["sentence"], set()).add(window["task"])
     # a sentence that names two tasks keeps to sentences that do so too
     return {
         sentence: sorted(set.intersection(*(by_task[task] for task in tasks)))

@@ -42,6 +42,8 @@ def write_calvin(
     root: Path,
     *,
     rgb: bool = False,
+    depth: bool = False,
+    tactile: bool = False,
     scene: str = "D",
     block_order: tuple[str, ...] | None = None,
     tasks: tuple[str, ...] = tuple(COMMANDS),
@@ -54,6 +56,7 @@ def write_calvin(
     Args:
         root: folder to create.
         rgb: write pictures too.
+        depth, tactile: write distances, and the fingertip sensors' pictures.
         scene: letter of the scene.
         block_order: colours of the block columns; the scene's own order by default.
         tasks: one per window.
@@ -95,6 +98,18 @@ def write_calvin(
             for name, size in (("rgb_static", 200), ("rgb_gripper", 84)):
                 picture = np.broadcast_to(background + 9 * (i % 20), (size, size, 3)).astype(np.uint8)
                 content[name] = np.ascontiguousarray(picture)
+        shade = np.linspace(0, 1, 200)[:, None]
+        if depth:
+            for name, size, near in (("depth_static", 200, 3.5), ("depth_gripper", 84, 0.05)):
+                content[name] = (near + 0.2 * shade[:size] + 0.01 * i + np.zeros((size, size))).astype(
+                    np.float32
+                )
+        if tactile:
+            content["rgb_tactile"] = np.full((160, 120, 6), 40 + i % 50, np.uint8)
+            content["rgb_tactile"][..., 3:] += 60
+            content["depth_tactile"] = (
+                1e-4 * shade[:160, :, None] * [i, 2.0 * i] + np.zeros((160, 120, 2))
+            ).astype(np.float32)
         frames[first + i] = content
         np.savez(folder / f"episode_{first + i:07d}.npz", **content)
     np.save(folder / "ep_start_end_ids.npy", np.array([[first, first + total - 1]]))

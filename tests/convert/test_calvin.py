@@ -14,8 +14,8 @@ from dataset_convert.calvin import VECTORS, CalvinSplit, load_object_array
 def read_all(calvin):
     split = CalvinSplit(calvin.root, "training")
     for window in split.windows:
-        columns = split.read(range(window.start, window.end), VECTORS)
-        checks.check_window(columns, window, split)
+        frames = range(window.start, window.end)
+        checks.check_frames(split.read(frames, VECTORS), frames, split)
 
 
 def test_a_valid_split_passes_every_check(calvin):

@@ -1,24 +1,25 @@
 """From a CALVIN split to a LeRobotDataset, as a user runs it."""
 
+import hashlib
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_calvin import write_calvin
+from fake_calvin import COMMANDS, write_calvin
 
-from dataset_convert import checks, convert
-from dataset_convert.calvin import COLOURS, CalvinSplit
+from dataset_convert import checks, convert, publish
+from dataset_convert.calvin import COLOURS
 from dataset_convert.convert import ClipOptions, ConvertConfig
-from dataset_convert.publish import publishing
 
 
 def options(calvin, output_dir, **changes):
-    return ConvertConfig(calvin.root, "me/desk", output_dir, **{"videos": False, **changes})
+    return ConvertConfig(calvin.root, "me/desk", output_dir, **{"images": "none", **changes})
 
 
 def load(folder):
@@ -63,13 +64,17 @@ def test_absolute_actions_on_request(calvin, tmp_path):
 def test_the_manifest_and_the_card_say_where_the_data_come_from(calvin, tmp_path):
     out = convert.convert(options(calvin, tmp_path / "out"))
     manifest = json.loads((out / "meta" / "calvin_source.json").read_text())
-    assert manifest["episodes"][1] == {
+    episode = {key: value for key, value in manifest["episodes"][1].items() if key != "sha256"}
+    assert episode == {"start": 112, "end": 124, "scene": "D", "windows": [1]}
+    assert manifest["windows"][1] == {
         "start": 112,
         "end": 124,
         "task": "lift_blue_block_table",
         "sentence": "pick up the blue block",
         "scene": "D",
     }
+    for name, sha in manifest["files"].items():
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == sha
     assert manifest["scenes"] == {"D": {"frames": [100, 147], "block_order": ["red", "blue", "pink"]}}
     assert manifest["request"]["split"] == "training"
     card = (out / "README.md").read_text()
@@ -78,8 +83,7 @@ def test_the_manifest_and_the_card_say_where_the_data_come_from(calvin, tmp_path
     assert str(tmp_path) not in card + json.dumps(manifest), "no path of this machine may be published"
 
 
-def test_several_workers_and_shards_give_the_same_files(calvin, tmp_path, monkeypatch):
-    monkeypatch.setattr(convert, "EPISODES_PER_SHARD", 1)
+def test_several_workers_and_shards_give_the_same_files(calvin, tmp_path):
     one = convert.convert(options(calvin, tmp_path / "one"))
     two = convert.convert(options(calvin, tmp_path / "two", workers=2))
     assert len(list(one.glob("data/*/*.parquet"))) == 4
@@ -88,64 +92,108 @@ def test_several_workers_and_shards_give_the_same_files(calvin, tmp_path, monkey
     assert [dataset[i]["calvin.frame"].item() for i in range(48)] == list(range(100, 148))
 
 
-def test_an_error_in_a_worker_reaches_the_user(calvin, tmp_path, monkeypatch):
-    monkeypatch.setattr(convert, "EPISODES_PER_SHARD", 1)
-    calvin.file(130).unlink()
-    with pytest.raises(FileNotFoundError, match="episode_0000130"):
+def test_an_error_in_a_worker_reaches_the_user_and_leaves_what_is_done_for_the_next_run(calvin, tmp_path):
+    calvin.rewrite(130, scene_obs=np.full(24, np.inf))
+    with pytest.raises(ValueError, match="episode_0000130"):
         convert.convert(options(calvin, tmp_path / "out", workers=2))
-    assert os.listdir(tmp_path) == ["calvin"]
+    assert sorted(os.listdir(tmp_path)) == [".out.incomplete", "calvin"]
+    calvin.rewrite(130)
+    with pytest.raises(ValueError, match="begun with other options"):
+        convert.convert(options(calvin, tmp_path / "out", action="abs"))
+    assert load(convert.convert(options(calvin, tmp_path / "out"))).num_frames == 48
+    assert sorted(os.listdir(tmp_path)) == ["calvin", "out"]
 
 
 def test_a_failed_run_leaves_nothing(calvin, tmp_path):
-    calvin.rewrite(140, scene_obs=np.full(24, np.inf))
-    with pytest.raises(ValueError, match="episode_0000140"):
+    calvin.rewrite(100, actions=np.full(7, np.inf))
+    with pytest.raises(ValueError, match="episode_0000100"):
         convert.convert(options(calvin, tmp_path / "out"))
     assert os.listdir(tmp_path) == ["calvin"]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_killed_run_leaves_nothing_that_loads_and_the_next_one_succeeds(
-    calvin, tmp_path, monkeypatch, workers
-):
-    import dataset_convert.writer  # noqa: F401  imported before the fork, which is then quick
+def converting(calvin, out, workers):
+    """The command in a process group of its own."""
+    command = [sys.executable, "-m", "dataset_convert", f"--root={calvin.root}", "--repo_id=me/desk"]
+    command += [f"--output_dir={out}", "--images=none", f"--workers={workers}"]
+    return subprocess.Popen(
+        command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
 
-    out, marker = tmp_path / "out", tmp_path / "started"
-    reading = CalvinSplit.read
 
-    def stall(self, frames, keys):
-        if frames == range(124, 136):
-            marker.touch()
-            time.sleep(60)
-        return reading(self, frames, keys)
+def wait_for(condition, seconds=120):
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert condition()
 
-    child = os.fork()
-    if child == 0:
-        monkeypatch.setattr(CalvinSplit, "read", stall)
-        convert.convert(options(calvin, out, workers=workers))
-        os._exit(0)
-    deadline = time.monotonic() + 30
-    while not marker.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    assert marker.exists()
+
+@pytest.mark.parametrize("whom", ["everybody", "a worker", "the parent"])
+def test_a_killed_run_leaves_nothing_that_loads_and_the_next_one_goes_on(tmp_path, whom):
+    calvin = write_calvin(tmp_path / "calvin", tasks=tuple(COMMANDS) * 8, length=25)
+    whole = convert.convert(options(calvin, tmp_path / "whole"))
+    out, staging = tmp_path / "out", tmp_path / ".out.incomplete"
+    stalled = calvin.file(712)  # reading it waits for somebody to write
+    content = stalled.read_bytes()
+    stalled.unlink()
+    os.mkfifo(stalled)
+    run = converting(calvin, out, workers=2)
+    wait_for(lambda: len(list(staging.glob("shards/*.json"))) >= 5)
+    if whom == "everybody":
+        os.killpg(run.pid, signal.SIGKILL)
+    elif whom == "the parent":
+        os.kill(run.pid, signal.SIGKILL)
+    else:
+        os.kill(max(workers_of(run.pid), key=lambda pid: reads(pid, stalled)), signal.SIGKILL)
+    assert run.wait(60) != 0
     assert not out.exists()
-    stale = [p for p in tmp_path.iterdir() if p.name.endswith(".incomplete")]
-    assert stale, "the kill came too late to test anything"
-    (stale[0] / "leftover.parquet").touch()
-    assert load(convert.convert(options(calvin, out))).num_frames == 48
-    assert not (out / "leftover.parquet").exists()
-    assert sorted(os.listdir(tmp_path)) == ["calvin", "out", "started"]
+    stalled.unlink()
+    stalled.write_bytes(content)
+    done = {note: note.stat().st_mtime_ns for note in staging.glob("shards/*.json")}
+    damaged = json.loads(min(done).read_text())["files"]
+    for name in damaged:  # what is on disk is checked before it is believed
+        (staging / "dataset" / name).write_bytes(b"half of a file")
+    convert.convert(options(calvin, out))
+    assert files_of(out) == files_of(whole)
+    assert sorted(os.listdir(tmp_path)) == ["calvin", "out", "whole"]
+
+
+def workers_of(parent):
+    """Processes of a session, but not the one that began it."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                session = int((entry / "stat").read_text().rpartition(")")[2].split()[3])
+            except (FileNotFoundError, ProcessLookupError):
+                continue
+            if session == parent and int(entry.name) != parent:
+                found.append(int(entry.name))
+    return found
+
+
+def reads(pid, path):
+    """Whether a process waits for a named pipe (it opens it, and that blocks)."""
+    try:
+        return (
+            "fifo" in Path(f"/proc/{pid}/wchan").read_text()
+            or "wait_for_partner" in Path(f"/proc/{pid}/wchan").read_text()
+        )
+    except OSError:
+        return False
 
 
 def test_two_runs_cannot_write_the_same_folder(tmp_path, monkeypatch):
     monkeypatch.setattr("dataset_convert.publish._PATIENCE", 0.2)
-    with publishing(tmp_path / "out") as first:
-        (first / "kept").touch()
-        with pytest.raises(ValueError, match="another process is writing"), publishing(tmp_path / "out"):
+    with publish.staging(tmp_path / "out", {"a": 1}) as first:
+        (first / "dataset" / "kept").touch()
+        with (
+            pytest.raises(ValueError, match="another process is writing"),
+            publish.staging(tmp_path / "out", {}),
+        ):
             pass
-        assert (first / "kept").exists()
+        publish.publish(first, tmp_path / "out")
     assert (tmp_path / "out" / "kept").exists()
+    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_the_same_request_again_changes_nothing_and_another_one_is_refused(calvin, tmp_path):
@@ -177,7 +225,7 @@ def test_the_command_converts_and_says_where(calvin, tmp_path, monkeypatch, caps
         "--split=training",
         "--repo_id=me/desk",
         where,
-        "--videos=false",
+        "--images=none",
     )
     assert code == 0
     assert str(tmp_path / "out") in printed.out
@@ -187,14 +235,19 @@ def test_the_command_converts_and_says_where(calvin, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--split=validation", "--videos=false"], "--split=validation"),
-        ([], "--videos=false"),
-        (["--videos=false", "--embed=true"], "'rgb_static' is missing"),
-        (["--videos=false", "--action=delta"], "--action=delta: expected rel or abs"),
-        (["--videos=false", "--workers=0"], "--workers=0"),
-        (["--videos=false", "--vcodec=mpeg1"], "--vcodec=mpeg1"),
-        (["--videos=perhaps"], "videos"),
+        (["--split=validation", "--images=none"], "--split=validation"),
+        ([], "--images=none"),
+        (["--images=none", "--embed=true"], "'rgb_static' is missing"),
+        (["--images=none", "--action=delta"], "--action=delta: expected rel or abs"),
+        (["--images=none", "--workers=0"], "--workers=0"),
+        (["--rgb_encoder.vcodec=mpeg1"], "--rgb_encoder.vcodec=mpeg1"),
+        (["--images=perhaps"], "--images=perhaps"),
         (["--colour=red"], "--colour=red"),
+        (["--images=none", "--mode=both"], "--mode=both: expected windows or play"),
+        (["--images=none", "--mode=play", "--dedup=task"], "--dedup is for --mode=windows"),
+        (["--images=none", "--depth=true"], "--images=none"),
+        (["--images=none", "--executor=cloud"], "--executor is one of"),
+        (["--images=none", "--split=training", "--exclude_shared=perhaps"], "exclude_shared"),
     ],
 )
 def test_a_wrong_option_is_one_clear_message_and_exit_code_2(
@@ -208,35 +261,11 @@ def test_a_wrong_option_is_one_clear_message_and_exit_code_2(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_option_is_named(monkeypatch, capsys, calvin):
-    code, printed = run_main(monkeypatch, capsys, f"--root={calvin.root}", "--repo_id=me/desk")
-    assert code == 2
-    assert "output_dir" in printed.err
-
-
-def test_pushing_uses_lerobots_method_with_the_version_tag(calvin, tmp_path, monkeypatch, capsys):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    calls = []
-
-    def push_to_hub(self, **kwargs):
-        calls.append((self.repo_id, self.root, kwargs))
-
-    monkeypatch.setattr(LeRobotDataset, "push_to_hub", push_to_hub)
-    arguments = [
-        f"--root={calvin.root}",
-        "--repo_id=me/desk",
-        f"--output_dir={tmp_path / 'out'}",
-        "--videos=false",
-    ]
-    code, _ = run_main(monkeypatch, capsys, *arguments, "--push_to_hub=true", "--private=true")
+def test_without_a_folder_it_goes_where_lerobot_looks(calvin, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
+    code, _ = run_main(monkeypatch, capsys, f"--root={calvin.root}", "--repo_id=me/desk", "--images=none")
     assert code == 0
-    repo_id, root, kwargs = calls[0]
-    assert (repo_id, root, kwargs["private"]) == ("me/desk", tmp_path / "out", True)
-    assert kwargs.get("tag_version", True), (
-        "a dataset without the version's tag cannot be loaded from the hub"
-    )
-    assert "Privileged state" in kwargs["dataset_description"]
+    assert load(tmp_path / "home" / "me" / "desk").num_episodes == 4
 
 
 def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_path):
@@ -265,7 +294,7 @@ def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_p
 def test_an_unknown_clip_is_reported_before_the_long_part(tmp_path, monkeypatch, capsys):
     pytest.importorskip("lerobot_lansar.policy.clip")
     calvin = write_calvin(tmp_path / "calvin", rgb=True, tasks=("open_drawer",), length=2)
-    monkeypatch.setattr(convert, "_run", lambda *_: pytest.fail("converted first"))
+    monkeypatch.setattr(convert, "run_shards", lambda *_, **__: pytest.fail("converted first"))
     base = [f"--root={calvin.root}", "--repo_id=me/desk", f"--output_dir={tmp_path / 'out'}", "--embed=true"]
     code, printed = run_main(monkeypatch, capsys, *base, "--clip.model=nothing")
     assert code == 2

@@ -50,7 +50,7 @@ def record(root, episodes):
     sizes = {"observation.state": 15, "observation.environment_state": 24, "action": 7}
     features = {k: {"dtype": "float32", "shape": (size,), "names": None} for k, size in sizes.items()}
     features["action"]["names"] = ACTION_NAMES["abs"]
-    dataset = LeRobotDataset.create("test/reach", fps=30, features=features, root=root, use_videos=False)
+    dataset = LeRobotDataset.create("test/reach", fps=30, features=features, root=root, use_images="none")
     rng = np.random.default_rng(0)
     for i in range(episodes):
         state, environment = start(rng)
@@ -142,7 +142,7 @@ def test_the_small_preset_fits_32_demonstrations_and_repeats_them(tmp_path):
     )  # fmt: skip
     root = convert(
         ConvertConfig(
-            root=folder, split="training", repo_id="test/desk", output_dir=tmp_path / "data", videos=False
+            root=folder, split="training", repo_id="test/desk", output_dir=tmp_path / "data", images="none"
         )
     )
     options = yaml.safe_load((CONFIGS / "lansar_small.yaml").read_text())["policy"]
@@ -152,7 +152,7 @@ def test_the_small_preset_fits_32_demonstrations_and_repeats_them(tmp_path):
     torch.manual_seed(0)
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(root)).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
-    episodes = json.loads((root / "meta" / "calvin_source.json").read_text())["episodes"]
+    episodes = json.loads((root / "meta" / "calvin_source.json").read_text())["windows"]
     tasks = [e["sentence"] for e in episodes for _ in range(e["end"] - e["start"])]
     losses = train(policy, preprocess, tasks, updates=400, batch_size=16)
     assert np.mean(losses[:20]) > 1

@@ -422,7 +422,7 @@ def test_mixed_precision_changes_neither_what_is_kept_nor_what_is_decided():
 def test_options_of_training_change_training_only(tmp_path):
     make_dataset(tmp_path / "data", "rel")
     episodes = [{"task": command, "sentence": command} for command in COMMANDS]
-    (tmp_path / "data" / "meta" / "calvin_source.json").write_text(json.dumps({"episodes": episodes}))
+    (tmp_path / "data" / "meta" / "calvin_source.json").write_text(json.dumps({"windows": episodes}))
     config = small_config(
         dropout=0.0, mlp_norm="layer", state_noise=0.01, contrastive_weight=0.5, paraphrases=True,
         egocentric_blocks=True,

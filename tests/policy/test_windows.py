@@ -138,12 +138,12 @@ def test_frame_arrays_are_kept_and_made_again_when_the_data_changes(tmp_path, mo
     assert {p.name for p in (tmp_path / "a").iterdir()} == {
         "data",
         "meta",
-        CACHE,
+        ".cache",
     }  # nothing half-written left
 
 
 def test_a_folder_that_cannot_be_written_to_is_read_into_memory(tmp_path, monkeypatch, relative):
-    shutil.copytree(relative[0], tmp_path / "d", ignore=shutil.ignore_patterns(CACHE))
+    shutil.copytree(relative[0], tmp_path / "d", ignore=shutil.ignore_patterns(".cache"))
 
     def refuse(self, *args, **kwargs):
         raise PermissionError(13, "Permission denied")
@@ -151,7 +151,7 @@ def test_a_folder_that_cannot_be_written_to_is_read_into_memory(tmp_path, monkey
     monkeypatch.setattr("pathlib.Path.mkdir", refuse)
     frames = load_frames(tmp_path / "d")
     assert len(frames["state"]) == sum(LENGTHS)
-    assert not (tmp_path / "d" / CACHE).exists()
+    assert not (tmp_path / "d" / ".cache").exists()
 
 
 def test_nan_in_a_dataset_is_named(tmp_path, monkeypatch):
@@ -249,9 +249,9 @@ def test_paraphrases_say_the_same_task_in_other_words(tmp_path):
         "lift_red_block_table": ["lift the red block", "lift it"],
     }
     episodes = [{"task": task, "sentence": sentence} for task, said in shown.items() for sentence in said]
-    with pytest.raises(ValueError, match="need task and sentence of every episode"):
+    with pytest.raises(ValueError, match="need task and sentence of every window"):
         make_windows(root, paraphrases=True)
-    (root / "meta" / "calvin_source.json").write_text(json.dumps({"episodes": episodes}))
+    (root / "meta" / "calvin_source.json").write_text(json.dumps({"windows": episodes}))
     windows = make_windows(root, paraphrases=True)
     torch.manual_seed(0)
     said = windows.say(["open the drawer"] * 50 + ["lift the red block"] * 50 + ["lift it"] * 5)

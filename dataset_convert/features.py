@@ -1,0 +1,177 @@
+"""What a converted dataset looks like to LeRobot: its features, its videos' codecs, the files that describe it."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from lerobot.configs import DepthEncoderConfig, RGBEncoderConfig
+from lerobot.datasets.compute_stats import aggregate_stats
+from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+from lerobot.datasets.feature_utils import create_empty_dataset_info, get_hf_features_from_features
+from lerobot.datasets.io_utils import write_info, write_stats, write_tasks
+from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, DatasetInfo
+from lerobot.datasets.video_utils import get_video_info
+from lerobot.utils.constants import DEFAULT_FEATURES
+
+from dataset_convert.calvin import CAMERAS, COLOURS, DEPTH, FPS, TACTILE
+from dataset_convert.writer import Codec, Layout, Picture, RGBEncoder, Stats
+
+_REL_NAMES = ["delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper"]
+_ABS_NAMES = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+_STATE_NAMES = [
+    *("tcp_x", "tcp_y", "tcp_z", "tcp_roll", "tcp_pitch", "tcp_yaw", "gripper_width"),
+    *(f"joint_{i}" for i in range(1, 8)),
+    "gripper_action",
+]
+_SCENE_NAMES = ["slider", "drawer", "button", "switch", "lightbulb", "led"] + [
+    f"{colour}_block_{axis}" for colour in COLOURS for axis in ("x", "y", "z", "roll", "pitch", "yaw")
+]
+_NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
+
+
+def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) -> tuple[Picture, ...]:
+    """All camera features that these options ask for.
+
+    Args:
+        images: "video", "png" or "none".
+        depth: both cameras' distances too.
+        tactile: the fingertip sensors too. Their depth, fractions of a millimetre, is always stored exactly.
+        encoder: of the colour videos.
+
+    Raises:
+        ValueError: LeRobot cannot encode like this here.
+    """
+    if images == "none":
+        return ()
+    video = images == "video"
+    colours, distances = (_rgb_codec(encoder), _depth_codec()) if video else (None, None)
+    found = [
+        Picture(f"observation.images.{array.removeprefix('rgb_')}", array, slice(None), shape, colours)
+        for array, shape in CAMERAS.items()
+    ]
+    if depth:
+        found += [
+            Picture(
+                f"observation.images.{array.removeprefix('depth_')}_depth", array, 0, (*shape, 1), distances
+            )
+            for array, shape in DEPTH.items()
+        ]
+    if tactile:
+        height, width, _ = TACTILE["rgb_tactile"]
+        for finger in range(2):
+            key = f"observation.images.tactile_{finger}"
+            part = slice(3 * finger, 3 * finger + 3)
+            found.append(Picture(key, "rgb_tactile", part, (height, width, 3), colours))
+            found.append(Picture(f"{key}_depth", "depth_tactile", finger, (height, width, 1)))
+    return tuple(found)
+
+
+def _rgb_config(encoder: RGBEncoder) -> RGBEncoderConfig:
+    try:
+        return RGBEncoderConfig(
+            vcodec=encoder.vcodec, crf=encoder.crf, preset=encoder.preset or None, g=encoder.g
+        )
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"--rgb_encoder.vcodec={encoder.vcodec}: {error}") from error
+
+
+def _rgb_codec(encoder: RGBEncoder) -> Codec:
+    config = _rgb_config(encoder)
+    # One thread per video: shards are what runs in parallel.
+    return Codec(config.vcodec, config.pix_fmt, config.get_codec_options(1, as_strings=True))
+
+
+def _depth_codec() -> Codec:
+    config = DepthEncoderConfig()
+    quantizer = {
+        name: getattr(config, name) for name in ("depth_min", "depth_max", "shift", "use_log", "pix_fmt")
+    }
+    return Codec(config.vcodec, config.pix_fmt, config.get_codec_options(1, as_strings=True), quantizer)
+
+
+def dataset_features(action: str, pictures: tuple[Picture, ...]) -> dict[str, dict]:
+    """LeRobot's description of the dataset's columns.
+
+    Args:
+        action: "rel" or "abs", the form that ``action`` holds; the other one is kept as ``calvin.…``, a name that
+            LeRobot does not take for something a policy should predict.
+        pictures: camera features.
+
+    Returns:
+        Feature name -> {"dtype", "shape", "names"}, LeRobot's own columns (``index``, …) included.
+    """
+
+    def vector(names: list[str]) -> dict:
+        return {"dtype": "float32", "shape": (len(names),), "names": names}
+
+    other = "calvin.actions" if action == "rel" else "calvin.rel_actions"
+    features = {
+        "observation.state": vector(_STATE_NAMES),
+        "observation.environment_state": vector(_SCENE_NAMES),
+        "action": vector(_REL_NAMES if action == "rel" else _ABS_NAMES),
+        other: vector(_ABS_NAMES if action == "rel" else _REL_NAMES),
+        **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
+    }
+    for picture in pictures:
+        features[picture.key] = {
+            "dtype": "video" if picture.codec else "image",
+            "shape": picture.shape,
+            "names": ["height", "width", "channels"],
+        }
+        if picture.is_depth:
+            features[picture.key]["info"] = {"is_depth_map": True, "depth_unit": "m"}
+    return {**features, **DEFAULT_FEATURES}
+
+
+def empty_info(action: str, pictures: tuple[Picture, ...]) -> DatasetInfo:
+    """The dataset's description before anything was written."""
+    has_videos = any(picture.codec for picture in pictures)
+    return create_empty_dataset_info(
+        CODEBASE_VERSION, FPS, dataset_features(action, pictures), has_videos, "panda"
+    )
+
+
+def layout_of(info: DatasetInfo, pictures: tuple[Picture, ...]) -> Layout:
+    """What the writer needs to know of a description."""
+    schema = get_hf_features_from_features(info.features).arrow_schema
+    return Layout(schema, pictures, info.chunks_size, DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH)
+
+
+def merge_stats(stats: list[Stats]) -> Stats:
+    """LeRobot's ``aggregate_stats``."""
+    return aggregate_stats(stats)
+
+
+def write_whole(
+    root: Path,
+    info: DatasetInfo,
+    layout: Layout,
+    encoder: RGBEncoder,
+    first_shard: int,
+    tasks: list[str],
+    episodes: int,
+    frames: int,
+    stats: Stats,
+) -> None:
+    """Writes the files that describe the whole dataset, after all shards.
+
+    Args:
+        root: the dataset's folder.
+        info: of :func:`empty_info`; its counters and its videos' properties are filled in.
+        layout: of the frames.
+        encoder: that the colour videos were made with.
+        first_shard: number of a shard that exists.
+        tasks: the sentences in the order of their numbers.
+        episodes, frames: how many there are.
+        stats: of all frames.
+    """
+    for picture in layout.pictures:
+        if picture.codec:
+            config: Any = DepthEncoderConfig() if picture.is_depth else _rgb_config(encoder)
+            found = get_video_info(root / layout.video_file(first_shard, picture.key), video_encoder=config)
+            info.features[picture.key]["info"] = {**info.features[picture.key].get("info", {}), **found}
+    info.total_episodes, info.total_frames, info.total_tasks = episodes, frames, len(tasks)
+    info.splits = {"train": f"0:{episodes}"}
+    write_tasks(pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")), root)
+    write_stats(stats, root)
+    write_info(info, root)

@@ -1,0 +1,145 @@
+"""The conversion's last step: all shards become one dataset."""
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dataset_convert import features
+from dataset_convert.shards import Job, describe, sha256
+from dataset_convert.writer import Stats
+
+MANIFEST = Path("meta") / "calvin_source.json"
+
+_EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+
+def finish(
+    job: Job, info: Any, encoder: features.RGBEncoder, request: dict[str, Any], report: dict[str, Any]
+) -> dict[str, Any]:
+    """Writes what describes the whole dataset, in the staging folder, after all shards; may be done again.
+
+    Args:
+        job: whose shards are all written.
+        info: LeRobot's description.
+        encoder: of the colour videos.
+        request: what was asked for.
+        report: what else the manifest should say; ``left_out`` is completed here.
+
+    Returns:
+        The manifest, as written to ``meta/calvin_source.json``.
+
+    Raises:
+        ValueError: every episode was left out.
+    """
+    episodes, frames, first_shard = 0, 0, None
+    files: dict[str, str] = {}
+    left_out, kept = list(report["left_out"]), []
+    stats: list[Stats] = []
+    for shard in range(len(job.shards)):
+        note = json.loads(job.note(shard).read_text())
+        left_out += note["left_out"]
+        if not note["episodes"]:
+            continue
+        first_shard = shard if first_shard is None else first_shard
+        table = pq.read_table(job.note(shard).with_suffix(".parquet"))
+        files |= note["files"]
+        if table["episode_index"][0].as_py() != episodes:
+            table = _renumber(table, episodes, frames)
+            data = job.layout.data_file(shard)
+            _renumber_frames(job.dataset / data, episodes, frames)
+            files[data] = sha256(job.dataset / data)
+        path = job.dataset / _EPISODES_PATH.format(**job.layout.numbers(shard))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, path)
+        episodes, frames = episodes + len(table), table["dataset_to_index"][-1].as_py()
+        stats.append(features.merge_stats(_stats_of(table)))
+        kept += note["episodes"]
+    if first_shard is None:
+        first = f"; the first: {left_out[0]['reason']}" if left_out else ""
+        raise ValueError(f"{job.split.folder}: no episode is left to convert{first}")
+    features.write_whole(
+        job.dataset,
+        info,
+        job.layout,
+        encoder,
+        first_shard,
+        job.tasks,
+        episodes,
+        frames,
+        features.merge_stats(stats),
+    )
+    orders = job.block_orders.items()
+    manifest = {
+        "request": request,
+        "scenes": {
+            s: {"frames": list(job.split.scenes[s]), "block_order": list(order)} for s, order in orders
+        },
+        "task_names": job.task_names,
+        "scene_names": job.scene_names,
+        "versions": {name: version(name) for name in ("lerobot_policy_lansar", "lerobot", "numpy", "av")},
+        **report,
+        "left_out": left_out,
+        "windows": [
+            {"start": w.start, "end": w.end, "task": w.task, "sentence": w.sentence, "scene": w.scene}
+            for w in job.split.windows
+        ],
+        "episodes": [{**describe(job.spans[e["number"]]), "sha256": e["sha256"]} for e in kept],
+        "files": files,
+    }
+    (job.dataset / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+    return manifest
+
+
+def _stats_of(table: pa.Table) -> list[Stats]:
+    """Each episode's statistics, out of its row of meta/episodes."""
+    columns = {name: table[name].to_pylist() for name in table.column_names if name.startswith("stats/")}
+    found: list[Stats] = [{} for _ in range(len(table))]
+    for column, values in columns.items():
+        _, key, name = column.split("/")
+        for stats, value in zip(found, values, strict=True):
+            stats.setdefault(key, {})[name] = np.array(value)
+    return found
+
+
+def _renumber(table: pa.Table, first_episode: int, first_index: int) -> pa.Table:
+    """A table of meta/episodes whose first episode and frame have these numbers."""
+    lengths = np.array(table["length"])
+    ends = first_index + np.cumsum(lengths)
+    columns = {
+        "episode_index": np.arange(first_episode, first_episode + len(table)),
+        "dataset_from_index": ends - lengths,
+        "dataset_to_index": ends,
+    }
+    for name, values in columns.items():
+        field = table.schema.field(name)
+        table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
+    return table
+
+
+def _renumber_frames(path: Path, first_episode: int, first_index: int) -> None:
+    """Gives the episodes and frames of one file other numbers; doing it again changes nothing."""
+    partial = path.with_suffix(".partial")
+    before, episode, index = None, first_episode - 1, first_index
+    with pq.ParquetFile(path) as source, pq.ParquetWriter(partial, source.schema_arrow) as target:
+        for group in range(source.num_row_groups):
+            table = source.read_row_group(group)
+            old = np.array(table["episode_index"])  # one episode: a row group is a block
+            episode += old[0] != before
+            before = old[0]
+            numbers = {
+                "episode_index": np.full(len(old), episode),
+                "index": np.arange(index, index + len(old)),
+            }
+            for name, values in numbers.items():
+                field = table.schema.field(name)
+                table = table.set_column(
+                    table.schema.get_field_index(name), field, pa.array(values, field.type)
+                )
+            target.write_table(table)
+            index += len(old)
+    partial.rename(path)

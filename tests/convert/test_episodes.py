@@ -1,0 +1,265 @@
+"""What becomes an episode, what is left out, and what a frame says of itself."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from fake_calvin import COMMANDS, write_calvin
+
+from dataset_convert import convert, episodes
+from dataset_convert.calvin import SCENES, TASKS, CalvinSplit, Window
+from dataset_convert.convert import ConvertConfig
+from dataset_convert.episodes import NO_COMMAND, window_spans
+from dataset_convert.shards import cut_into_shards
+
+
+def options(calvin, output_dir, **changes):
+    return ConvertConfig(calvin.root, "me/desk", output_dir, **{"images": "none", **changes})
+
+
+def load(folder):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset("me/desk", root=folder)
+
+
+def manifest_of(folder):
+    return json.loads((folder / "meta" / "calvin_source.json").read_text())
+
+
+def column(dataset, name):
+    return dataset.hf_dataset.with_format("numpy")[:][name]
+
+
+def annotate(calvin, windows):
+    """Writes (start, end, task) as the language file."""
+    annotations = {
+        "language": {
+            "ann": [COMMANDS.get(task, task) for *_, task in windows],
+            "task": [task for *_, task in windows],
+        },
+        "info": {"indx": [(start, end) for start, end, _ in windows]},
+    }
+    np.save(calvin.root / "training/lang_annotations/auto_lang_ann.npy", annotations, allow_pickle=True)
+
+
+def record_as(calvin, *recordings):
+    np.save(calvin.root / "training/ep_start_end_ids.npy", np.array(recordings))
+
+
+def test_the_tasks_are_those_of_the_desk():
+    desk = pytest.importorskip("lerobot_lansar.desk")
+    assert list(desk.TASKS) == list(TASKS)
+
+
+def test_play_has_every_frame_once_and_windows_as_annotations(calvin, tmp_path):
+    annotate(calvin, [(103, 110, "open_drawer"), (106, 120, "close_drawer"), (130, 135, "open_drawer")])
+    record_as(calvin, (100, 124), (125, 147))
+    out = convert.convert(options(calvin, tmp_path / "out", mode="play"))
+    dataset = load(out)
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 48)
+    np.testing.assert_array_equal(column(dataset, "calvin.frame"), np.arange(100, 148))
+    windows = column(dataset, "calvin.window")
+    # of two windows the one that ends first
+    expected = [-1] * 3 + [0] * 7 + [1] * 10 + [-1] * 10 + [2] * 5 + [-1] * 13
+    assert windows.tolist() == expected
+    sentences = [COMMANDS["open_drawer"], "close_drawer", COMMANDS["open_drawer"], NO_COMMAND]
+    assert [dataset[i]["task"] for i in range(48)] == [sentences[w] for w in expected]
+    numbers = {0: TASKS.index("open_drawer"), 1: TASKS.index("close_drawer"), 2: TASKS.index("open_drawer")}
+    assert column(dataset, "calvin.task").tolist() == [numbers.get(w, -1) for w in expected]
+    assert set(column(dataset, "calvin.scene").tolist()) == {SCENES.index("D")}
+    assert [e["windows"] for e in manifest_of(out)["episodes"]] == [[0, 1], [2]]
+    assert dataset.meta.episodes[0]["tasks"] == [NO_COMMAND, sentences[0], sentences[1]]
+
+
+def test_a_long_recording_is_cut_where_no_window_is(calvin, tmp_path, monkeypatch):
+    monkeypatch.setattr(episodes, "MAX_FRAMES", 20)
+    split = CalvinSplit(calvin.root, "training")
+    spans = episodes.play_spans(split, [])
+    assert [(s.start, s.end) for s in spans] == [(100, 112), (112, 124), (124, 136), (136, 148)]
+    annotate(calvin, [(100, 148, "open_drawer")])
+    spans = episodes.play_spans(CalvinSplit(calvin.root, "training"), [])
+    assert [(s.start, s.end, s.windows) for s in spans] == [(100, 120, ()), (120, 140, ()), (140, 148, ())]
+
+
+def test_dedup_keeps_as_many_windows_as_it_can():
+    spans = [(0, 10, "a"), (5, 12, "a"), (8, 14, "b"), (11, 20, "a"), (14, 22, "b"), (0, 30, "c")]
+    windows = [Window(start, end, task, task, "D") for start, end, task in spans]
+    kept = {how: [s.windows[0] for s in window_spans(windows, how, [])] for how in ("none", "task", "frames")}
+    assert kept["none"] == [0, 1, 2, 3, 4, 5]
+    assert kept["task"] == [0, 2, 3, 4, 5]
+    assert kept["frames"] == [0, 3]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_dedup_is_the_best_choice_of_all(seed):
+    rng = np.random.default_rng(seed)
+    starts = rng.integers(0, 30, 9)
+    windows = [
+        Window(int(s), int(s + n), "t", "t", "D") for s, n in zip(starts, rng.integers(1, 12, 9), strict=True)
+    ]
+
+    def most(numbers, free_from):
+        later = [n for n in numbers if windows[n].start >= free_from]
+        return max((1 + most(numbers, windows[n].end) for n in later), default=0)
+
+    kept = window_spans(windows, "frames", [])
+    assert len(kept) == most(range(9), 0)
+    for a, b in zip(
+        sorted(kept, key=lambda s: s.start), sorted(kept, key=lambda s: s.start)[1:], strict=False
+    ):
+        assert a.end <= b.start
+
+
+def test_frames_of_both_splits_are_reported_and_left_out_on_request(calvin, tmp_path, capsys):
+    (calvin.root / "validation").mkdir()
+    for frame in (105, 113):
+        shutil.copy(calvin.file(frame), calvin.root / "validation")
+    kept = convert.convert(options(calvin, tmp_path / "kept"))
+    assert "frames 105, 113 are in training and in validation: kept" in capsys.readouterr().err
+    assert load(kept).num_episodes == 4
+    assert manifest_of(kept)["shared_frames"] == [105, 113]
+    assert "105, 113" in (kept / "README.md").read_text()
+    out = convert.convert(options(calvin, tmp_path / "out", exclude_shared=True))
+    assert not {105, 113} & set(column(load(out), "calvin.frame").tolist())
+    assert load(out).num_episodes == 2
+    play = convert.convert(options(calvin, tmp_path / "play", exclude_shared=True, mode="play"))
+    assert column(load(play), "calvin.frame").tolist() == [f for f in range(100, 148) if f not in (105, 113)]
+    assert load(play).num_episodes == 3, "cut where a frame was taken out, so that times stay 1/30 s"
+
+
+def test_all_missing_frames_are_listed(calvin, tmp_path):
+    for frame in (105, 106, 107, 140):
+        calvin.file(frame).unlink()
+    with pytest.raises(FileNotFoundError, match=r"4 frames in all: 105-107, 140; .*--skip_bad=true"):
+        convert.convert(options(calvin, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+DEFECTS = {
+    "a missing frame": lambda calvin: calvin.file(113).unlink(),
+    "a truncated frame": lambda calvin: calvin.file(113).write_bytes(calvin.file(113).read_bytes()[:-50]),
+    "a number that is not finite": lambda calvin: calvin.rewrite(113, robot_obs=np.full(15, np.nan)),
+    "a wrong relative action": lambda calvin: calvin.rewrite(113, rel_actions=np.full(7, 0.2)),
+    "a wrong shape": lambda calvin: calvin.rewrite(113, scene_obs=np.zeros(23)),
+    "a picture of a wrong size": lambda calvin: calvin.rewrite(
+        113, rgb_static=np.zeros((200, 199, 3), np.uint8)
+    ),
+    "no picture": lambda calvin: calvin.rewrite(113, rgb_gripper=None),
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+@pytest.mark.parametrize("mode", ["windows", "play"])
+def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monkeypatch, capsys, defect, mode):
+    monkeypatch.setattr("dataset_convert.shards.BLOCK", 5)  # it is found after a part was written
+    if mode == "windows":  # good and bad ones in one file; in play a file each
+        monkeypatch.setattr(convert, "cut_into_shards", lambda lengths, most: [(0, len(lengths))])
+    calvin = write_calvin(tmp_path / "calvin", rgb=True, length=12)
+    record_as(calvin, (100, 111), (112, 123), (124, 147))
+    DEFECTS[defect](calvin)
+    with pytest.raises((ValueError, FileNotFoundError), match="episode_0000113"):
+        convert.convert(options(calvin, tmp_path / "strict", images="video", mode=mode))
+    out = convert.convert(options(calvin, tmp_path / "out", images="video", mode=mode, skip_bad=True))
+    dataset = load(out)
+    kept = [frame for frame in range(100, 148) if not 112 <= frame < 124]
+    assert column(dataset, "calvin.frame").tolist() == kept
+    assert column(dataset, "index").tolist() == list(range(36))
+    assert column(dataset, "episode_index").tolist() == [0] * 12 + (
+        [1] * 12 + [2] * 12 if mode == "windows" else [1] * 24
+    )
+    for index in range(0, 36, 7):  # the videos go with it
+        wanted = calvin.frames[kept[index]]["rgb_static"].transpose(2, 0, 1) / 255
+        np.testing.assert_allclose(dataset[index]["observation.images.static"], wanted, atol=0.02)
+    (bad,) = manifest_of(out)["left_out"]
+    assert (bad["start"], bad["end"]) == (112, 124)
+    assert "left out: frames 112-123" in capsys.readouterr().err
+    assert "1 defective episodes" in (out / "README.md").read_text()
+
+
+def test_nothing_left_is_an_error(calvin, tmp_path):
+    for frame in range(100, 148):
+        calvin.rewrite(frame, actions=np.full(7, np.nan))
+    with pytest.raises(ValueError, match=r"no episode is left to convert; the first: .*episode_0000100"):
+        convert.convert(options(calvin, tmp_path / "out", skip_bad=True))
+
+
+def test_depth_and_touch_on_request(tmp_path):
+    calvin = write_calvin(
+        tmp_path / "calvin", rgb=True, depth=True, tactile=True, tasks=("open_drawer",), length=8
+    )
+    for images, tolerance in (("video", 2e-3), ("png", 0)):
+        out = convert.convert(options(calvin, tmp_path / images, images=images, depth=True, tactile=True))
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        dataset = LeRobotDataset("me/desk", root=out, depth_output_unit="m")
+        for index, frame in enumerate(range(100, 108)):
+            item, source = dataset[index], calvin.frames[frame]
+            for name, array in (("static_depth", "depth_static"), ("gripper_depth", "depth_gripper")):
+                stored = item[f"observation.images.{name}"]
+                assert stored.shape == (1, *source[array].shape)
+                np.testing.assert_allclose(stored[0], source[array], atol=tolerance)
+            for finger in range(2):
+                colours = source["rgb_tactile"][..., 3 * finger : 3 * finger + 3].transpose(2, 0, 1) / 255
+                np.testing.assert_allclose(item[f"observation.images.tactile_{finger}"], colours, atol=0.02)
+                np.testing.assert_array_equal(
+                    item[f"observation.images.tactile_{finger}_depth"][0],
+                    source["depth_tactile"][..., finger],
+                )
+        assert set(dataset.meta.depth_keys) == {
+            f"observation.images.{name}_depth" for name in ("static", "gripper", "tactile_0", "tactile_1")
+        }
+        assert 3 < dataset.meta.stats["observation.images.static_depth"]["mean"].item() < 4
+    plain = write_calvin(tmp_path / "plain", rgb=True, tasks=("open_drawer",), length=8)
+    with pytest.raises(ValueError, match="'depth_static' is missing; not recorded"):
+        convert.convert(options(plain, tmp_path / "none", images="png", depth=True))
+
+
+def test_a_distance_that_a_depth_video_cannot_hold_is_an_error(tmp_path):
+    calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tasks=("open_drawer",), length=3)
+    calvin.rewrite(101, depth_static=np.full((200, 200), 11, np.float32))
+    with pytest.raises(ValueError, match=r"depth_static: distances of .* to 11 m do not fit .*--images=png"):
+        convert.convert(options(calvin, tmp_path / "out", images="video", depth=True))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_shards_are_whole_episodes_and_alike(seed):
+    lengths = np.random.default_rng(seed).integers(1, 65, 400).tolist()
+    shards = cut_into_shards(lengths, most=500)
+    assert [first for first, _ in shards[1:]] == [end for _, end in shards[:-1]]
+    assert (shards[0][0], shards[-1][1]) == (0, 400)
+    frames = [sum(lengths[first:end]) for first, end in shards]
+    assert all(500 <= n < 565 for n in frames[:-1])
+    assert len(cut_into_shards(lengths[:20], most=500)) >= 10
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_folders_convert_exactly(tmp_path, seed):
+    """A property: whatever the folder and the options, lansar-verify finds every frame in its place."""
+    from dataset_convert.verify import VerifyConfig, verify
+
+    rng = np.random.default_rng(seed)
+    tasks = tuple(rng.choice(list(COMMANDS), rng.integers(2, 6)))
+    length = int(rng.integers(4, 12))
+    calvin = write_calvin(
+        tmp_path / "calvin", rgb=True, scene=str(rng.choice(list(SCENES))), tasks=tasks, length=length,
+        overlap=int(rng.integers(0, length // 2)), seed=seed,
+    )  # fmt: skip
+    changes = {
+        "mode": str(rng.choice(["windows", "play"])),
+        "images": str(rng.choice(["video", "png"])),
+        "action": str(rng.choice(["rel", "abs"])),
+    }
+    if changes["mode"] == "windows":
+        changes["dedup"] = str(rng.choice(["none", "task", "frames"]))
+    out = convert.convert(options(calvin, tmp_path / "out", **changes))
+    report = verify(VerifyConfig("me/desk", calvin.root, out, min_psnr=35))
+    assert f"{manifest_of(out)['request']['split']}" in report
+    dataset = load(out)
+    for index in rng.integers(0, len(dataset), 5):
+        item = dataset[int(index)]
+        source = calvin.frames[item["calvin.frame"].item()]
+        np.testing.assert_array_equal(item["observation.state"], source["robot_obs"].astype(np.float32))
+        picture = source["rgb_static"].transpose(2, 0, 1) / 255
+        np.testing.assert_allclose(item["observation.images.static"], picture, atol=0.02)
