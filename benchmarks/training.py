@@ -58,7 +58,7 @@ def random_dataset(root: Path, embedding: int, episodes: int = 20, length: int =
     names = {"action": ACTION_NAMES["rel"]}
     features = {k: {"dtype": "float32", "shape": (size,), "names": names.get(k)} for k, size in sizes.items()}
     dataset = LeRobotDataset.create(
-        "benchmark/random", fps=30, features=features, root=root, use_images="none"
+        "benchmark/random", fps=30, features=features, root=root, use_videos=False
     )
     rng = np.random.default_rng(0)
     for _ in tqdm(range(episodes), desc="Making demonstrations", leave=False):

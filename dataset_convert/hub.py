@@ -17,5 +17,5 @@ def push(root: Path, repo_id: str, private: bool) -> None:
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    dataset = LeRobotDataset(repo_id, root=root)
+    dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")  # it need not look for another one
     dataset.push_to_hub(private=private, **card.fields(root, repo_id))

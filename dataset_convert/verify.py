@@ -25,6 +25,8 @@ from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
 from dataset_convert.shards import sha256
 from dataset_convert.writer import digest
 
+_BETTER = 0.9  # of the squared error; a video of the desk that is a frame off has more than twice that of a right one
+
 
 @dataclass
 class VerifyConfig:
@@ -350,7 +352,7 @@ def _compare(stored: np.ndarray, wanted: np.ndarray, feature: dict[str, Any], pl
     """Signal-to-noise ratio (dB) of each picture of a video; of distances against the farthest that fits.
 
     Raises:
-        Mismatch: the pictures fit better when they are moved by one frame.
+        Mismatch: the pictures fit better when they are moved by one frame, or with red and blue exchanged.
     """
     peak = 255.0
     if feature["shape"][2] == 1:
@@ -367,13 +369,17 @@ def _compare(stored: np.ndarray, wanted: np.ndarray, feature: dict[str, Any], pl
         return (difference**2).reshape(len(a), -1).mean(axis=1)
 
     error = errors(stored, wanted)
+    visible = (peak / 255) ** 2  # below it a codec's rounding decides what fits best
+    here = error.mean()
+    if wanted.ndim == 4 and here > visible and errors(stored, wanted[..., ::-1]).mean() < _BETTER * here:
+        raise Mismatch(f"{place}: red and blue are exchanged")
     if len(stored) > 2:
         here = error[1:-1].mean()
         for name, moved in (
             ("late", errors(stored[1:-1], wanted[:-2])),
             ("early", errors(stored[1:-1], wanted[2:])),
         ):
-            if moved.mean() < 0.98 * here:
+            if moved.mean() < _BETTER * here and here > visible:
                 raise Mismatch(f"{place}: the video is a frame {name}")
     return (10 * np.log10(peak**2 / np.maximum(error, 1e-9))).tolist()
 

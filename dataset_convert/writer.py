@@ -351,7 +351,10 @@ class Video:
         path.parent.mkdir(parents=True, exist_ok=True)
         av.logging.set_level(av.logging.ERROR)  # x264 tells a dozen lines per file
         self.container: Any = av.open(str(path), "w")
-        stream: Any = self.container.add_stream(self._codec.name, FPS, options=self._codec.options)
+        options = dict(self._codec.options)
+        if "x265-params" in options:  # it does not go through libav's log
+            options["x265-params"] += ":log-level=error"
+        stream: Any = self.container.add_stream(self._codec.name, FPS, options=options)
         stream.pix_fmt = self._codec.pix_fmt
         stream.height, stream.width = picture.shape[:2]
         self.stream = stream

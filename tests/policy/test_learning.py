@@ -50,7 +50,7 @@ def record(root, episodes):
     sizes = {"observation.state": 15, "observation.environment_state": 24, "action": 7}
     features = {k: {"dtype": "float32", "shape": (size,), "names": None} for k, size in sizes.items()}
     features["action"]["names"] = ACTION_NAMES["abs"]
-    dataset = LeRobotDataset.create("test/reach", fps=30, features=features, root=root, use_images="none")
+    dataset = LeRobotDataset.create("test/reach", fps=30, features=features, root=root, use_videos=False)
     rng = np.random.default_rng(0)
     for i in range(episodes):
         state, environment = start(rng)
