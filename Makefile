@@ -19,7 +19,7 @@ quickstart: install
 	@.venv/bin/python scripts/quickstart.py
 
 test: install
-	@.venv/bin/python -m pytest
+	@.venv/bin/python -m pytest -n auto --maxprocesses 8 --dist loadfile
 
 lint: install
 	.venv/bin/ruff check .

@@ -219,7 +219,13 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
     """
     shared = shared_frames(split) if config.split == "training" else []
     if shared:
+        used = [f for f in shared if any(first <= f <= last for first, last in split.recordings)]
         what = "left out" if config.exclude_shared else "kept; --exclude_shared=true leaves them out"
+        what = (
+            f"{len(used)} of them inside training's recordings, {what}"
+            if used
+            else "in no recording, so not converted"
+        )
         _say(f"frames {as_ranges(shared)} are in training and in validation: {what}")
     excluded = shared if config.exclude_shared else []
     if config.mode == "play":

@@ -138,8 +138,9 @@ def layout_of(info: DatasetInfo, pictures: tuple[Picture, ...]) -> Layout:
 
 
 def merge_stats(stats: list[Stats]) -> Stats:
-    """LeRobot's ``aggregate_stats``."""
-    return aggregate_stats(stats)
+    """LeRobot's ``aggregate_stats`` in the order of the first item; its own order differs from run to run."""
+    merged = aggregate_stats(stats)
+    return {key: merged[key] for key in stats[0]}
 
 
 def write_whole(

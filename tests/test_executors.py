@@ -30,20 +30,22 @@ exec "$@"
 """
 
 
-def record(output, *options, **environment):
-    command = [
-        sys.executable,
-        "-m",
-        "lerobot_lansar.demos.record",
-        f"--output_dir={output}",
-        *OPTIONS,
-        *options,
-    ]
+def run(module, output, *options, **environment):
+    command = [sys.executable, "-m", module, f"--output_dir={output}", *options]
     done = subprocess.run(
         command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def record(output, *options, **environment):
+    return run("lerobot_lansar.demos.record", output, *OPTIONS, *options, **environment)
+
+
+def convert(root, output, *options, **environment):
+    fixed = [f"--root={root}", "--repo_id=me/desk", "--images=none"]
+    return run("dataset_convert", output, *fixed, *options, **environment)
 
 
 def frames(folder):
@@ -59,6 +61,10 @@ def assert_same(one, other):
             np.testing.assert_array_equal(value, b[name][key])
 
 
+def contents(folder):
+    return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
 @pytest.fixture(scope="module")
 def local(tmp_path_factory):
     folder = tmp_path_factory.mktemp("local") / "desk"
@@ -66,13 +72,27 @@ def local(tmp_path_factory):
     return folder
 
 
-def test_slurm_jobs_record_the_same(local, tmp_path):
-    """Scripts stand in for Slurm's commands and run the arrays that datatrove submits, job scripts and all, here."""
+@pytest.fixture(scope="module")
+def converted(local, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("converted") / "out"
+    convert(local, folder)
+    return folder
+
+
+@pytest.fixture
+def slurm(tmp_path):
+    """A PATH on which scripts stand in for Slurm's commands; they run the arrays that datatrove submits, job scripts
+    and all, here."""
     for name, text in (("sbatch", SBATCH), ("srun", SRUN), ("scontrol", "#!/bin/sh\necho here\n")):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
-    path = f"{tmp_path}:{Path(sys.executable).parent}:{os.environ['PATH']}"
-    printed = record(tmp_path / "desk", "--executor=slurm", "--workers=2", "--slurm.partition=cpu", PATH=path)
+    return f"{tmp_path}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+
+
+def test_slurm_jobs_record_the_same(local, slurm, tmp_path):
+    printed = record(
+        tmp_path / "desk", "--executor=slurm", "--workers=2", "--slurm.partition=cpu", PATH=slurm
+    )
     assert "submitted" in printed
     assert_same(local, tmp_path / "desk")
     script = (tmp_path / "desk" / ".recording-slurm" / "work" / "launch_script.slurm").read_text()
@@ -105,3 +125,17 @@ def test_ray_records_the_same(local, tmp_path):
     pytest.importorskip("ray", reason="needs the extra ray")
     record(tmp_path / "desk", "--executor=ray", "--workers=2")
     assert_same(local, tmp_path / "desk")
+
+
+def test_slurm_jobs_convert_the_same(local, converted, slurm, tmp_path):
+    options = ["--executor=slurm", "--workers=2", "--slurm.partition=cpu"]
+    convert(local, tmp_path / "out", *options, PATH=slurm)
+    script = (tmp_path / "out.slurm_logs" / "work" / "launch_script.slurm").read_text()
+    assert "#SBATCH --partition=cpu" in script
+    assert contents(tmp_path / "out") == contents(converted)
+
+
+def test_ray_converts_the_same(local, converted, tmp_path):
+    pytest.importorskip("ray", reason="needs the extra ray")
+    convert(local, tmp_path / "out", "--executor=ray", "--workers=2")
+    assert contents(tmp_path / "out") == contents(converted)

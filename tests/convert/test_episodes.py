@@ -117,7 +117,8 @@ def test_frames_of_both_splits_are_reported_and_left_out_on_request(calvin, tmp_
     for frame in (105, 113):
         shutil.copy(calvin.file(frame), calvin.root / "validation")
     kept = convert.convert(options(calvin, tmp_path / "kept"))
-    assert "frames 105, 113 are in training and in validation: kept" in capsys.readouterr().err
+    said = "frames 105, 113 are in training and in validation: 2 of them inside training's recordings, kept"
+    assert said in capsys.readouterr().err
     assert load(kept).num_episodes == 4
     assert manifest_of(kept)["shared_frames"] == [105, 113]
     assert "105, 113" in (kept / "README.md").read_text()
@@ -127,6 +128,15 @@ def test_frames_of_both_splits_are_reported_and_left_out_on_request(calvin, tmp_
     play = convert.convert(options(calvin, tmp_path / "play", exclude_shared=True, mode="play"))
     assert column(load(play), "calvin.frame").tolist() == [f for f in range(100, 148) if f not in (105, 113)]
     assert load(play).num_episodes == 3, "cut where a frame was taken out, so that times stay 1/30 s"
+
+
+def test_frames_of_both_splits_that_no_recording_holds_are_reported_as_such(calvin, tmp_path, capsys):
+    """So it is in the public ABCD data."""
+    (calvin.root / "validation").mkdir()
+    for folder in ("training", "validation"):
+        shutil.copy(calvin.file(105), calvin.root / folder / "episode_0000090.npz")
+    assert load(convert.convert(options(calvin, tmp_path / "out"))).num_episodes == 4
+    assert "frames 90 are in training and in validation: in no recording" in capsys.readouterr().err
 
 
 def test_all_missing_frames_are_listed(calvin, tmp_path):

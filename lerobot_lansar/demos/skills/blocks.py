@@ -416,8 +416,9 @@ def push_into_drawer(view: View) -> Iterator[Waypoint]:
     """Push the block nearest to the open drawer over the table's edge; first fetch it in front of the drawer."""
     for _ in range(TRIES + 2):
         color = _nearest_to_drawer(view)
-        if color is None:
-            return
+        if color is None:  # one that tips over the edge takes a moment to land
+            yield view.go(view.tcp.copy(), CLOSED, view.robot_obs[3:6].copy(), hold=15)
+            continue
         pose = view.block(color)
         to_edge = pose[1] - (TABLE_FRONT - 0.03)
         half = _half_width(view, color, np.array([0.0, 1.0]))
