@@ -149,6 +149,25 @@ def test_act_trains_on_the_dataset_and_runs_on_the_desk(run, work, dataset):
     assert len(successes(work, "eval_act")[0]) == 2
 
 
+def test_diffusion_trains_on_one_camera_of_the_dataset_and_runs_on_the_desk(run, work, dataset):
+    """It wants all its pictures of one size; docs/dataset.md says how to name its inputs."""
+    inputs = {
+        "observation.state": {"type": "STATE", "shape": [15]},
+        "observation.images.static": {"type": "VISUAL", "shape": [3, 200, 200]},
+    }
+    run(
+        "lerobot-train", "--policy.type=diffusion", "--policy.push_to_hub=false", "--policy.device=cpu", *dataset,
+        *TRAINING, f"--policy.input_features={json.dumps(inputs)}", "--policy.down_dims=[32,64]", "--policy.horizon=8",
+        "--policy.n_action_steps=4", "--policy.num_inference_steps=2", "--policy.pretrained_backbone_weights=null",
+        "--steps=2", "--output_dir=out/diffusion",
+    )  # fmt: skip
+    run(
+        "lerobot-eval", "--policy.path=out/diffusion/checkpoints/last/pretrained_model", *EVALUATION,
+        "--env.task=turn_on_led", "--eval.n_episodes=1", "--eval.batch_size=1", "--output_dir=eval_diffusion",
+    )  # fmt: skip
+    assert len(successes(work, "eval_diffusion")[0]) == 1
+
+
 def test_unusable_requests_are_answered_clearly(run, dataset):
     assert "'juggle' is unknown" in run(
         "lerobot-eval", "--policy.type=act", "--policy.device=cpu", "--env.type=calvin", "--env.task=juggle",

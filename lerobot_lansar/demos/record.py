@@ -1,7 +1,6 @@
 """``lansar-record``: scripted demonstrations on the desk, in CALVIN's own on-disk format."""
 
 import contextlib
-import importlib.util
 import json
 import shlex
 import shutil
@@ -19,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from ..desk import CONTROL_HZ, SCENES, Desk, DeskError, SimulationError
 from ..desk.commands import load_commands
-from ..executors import EXECUTORS, SlurmConfig, WorkerDied, run_shards
+from ..executors import SlurmConfig, WorkerDied, check_executor, run_shards
 from .calvin_folder import FrameWriter, Unit, group_by_scene, publish_split
 from .demonstrator import Demonstration, demonstrate
 from .play_data import record_play
@@ -79,7 +78,7 @@ class RecordConfig:
             self.validation_hours = self.hours / 10
 
     def check(self) -> None:
-        """Raises DeskError for options that cannot be carried out."""
+        """Raises ValueError for options that cannot be carried out."""
         for task in self.tasks:
             if task not in SKILLS:
                 raise DeskError(f"--tasks: there is no task {task!r}; choose among: {', '.join(SKILLS)}")
@@ -92,12 +91,7 @@ class RecordConfig:
             raise DeskError(f"--scene must name one scene, or different ones as '[A,B]', got {self.scene}")
         if self.mode not in ("windows", "play"):
             raise DeskError(f"--mode is windows or play, got {self.mode!r}")
-        if self.executor not in EXECUTORS:
-            raise DeskError(f"--executor is one of {', '.join(EXECUTORS)}, got {self.executor!r}")
-        if self.executor == "slurm" and (shutil.which("sbatch") is None or not self.slurm.partition):
-            raise DeskError("--executor=slurm needs Slurm's sbatch on the PATH, and --slurm.partition=NAME")
-        if self.executor == "ray" and importlib.util.find_spec("ray") is None:
-            raise DeskError("--executor=ray needs Ray: pip install 'lerobot_policy_lansar[ray]'")
+        check_executor(self.executor, self.slurm)
         if not 0 <= self.variety <= 1:
             raise DeskError(f"--variety lies between 0 and 1, got {self.variety}")
         if not 0 <= self.noise <= 0.5:
@@ -154,7 +148,8 @@ def record(config: RecordConfig) -> Path:
     one rename.
 
     Raises:
-        DeskError: The folder holds a finished recording, or one that was begun with other options or is being made.
+        ValueError: An option is wrong; the folder holds a finished recording, or one that was begun with other options
+            or is being made.
         WorkerDied: A worker was killed.
     """
     config.check()
@@ -381,7 +376,7 @@ def main() -> None:
     """Entry point of ``lansar-record``."""
     try:
         record(draccus.parse(RecordConfig))
-    except (DeskError, WorkerDied, OSError, draccus.utils.ParsingError) as error:
+    except (ValueError, WorkerDied, OSError, draccus.utils.ParsingError) as error:
         print(f"lansar-record: error: {error}", file=sys.stderr)
         sys.exit(2)
     except subprocess.CalledProcessError as error:

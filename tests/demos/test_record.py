@@ -289,6 +289,6 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
     ],
 )
 def test_impossible_requests_are_refused_before_anything_is_written(tmp_path, change, message):
-    with pytest.raises(DeskError, match=message):
+    with pytest.raises(ValueError, match=message):
         record(options(tmp_path / "desk", **change))
     assert not (tmp_path / "desk").exists()
