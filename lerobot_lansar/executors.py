@@ -183,6 +183,7 @@ def _end_with_parent() -> None:
 
 
 _watching = False
+_GRACE = 5.0  # s in which a pool that lost a worker may end by itself
 
 
 @contextlib.contextmanager
@@ -211,9 +212,11 @@ def _watched(progress: Callable[[], int], total: int, unit: str, desc: str) -> I
                 if new := progress() - bar.n:
                     bar.update(new)
                 pool = {p.pid for p in multiprocess.active_children() if "PoolWorker" in p.name}
-                if known - pool and progress() < total and not ended.wait(5):
+                if known - pool and progress() < total and not ended.wait(_GRACE):
                     died.set()
                     os.kill(os.getpid(), signal.SIGINT)
+                    while not ended.wait(2 * _GRACE):  # the pool's end hangs too if the dead one held a lock
+                        os.kill(os.getpid(), signal.SIGINT)
                     return
                 known = pool
             bar.update(progress() - bar.n)

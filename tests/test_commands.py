@@ -34,8 +34,9 @@ def run(work):
 
 @pytest.fixture(scope="module")
 def dataset(run, work):
-    """Four demonstrations with pictures, converted with videos and CLIP embeddings."""
-    run("lansar-record", "--output_dir=desk", "--tasks=[turn_on_led,turn_off_led]", "--episodes=4")
+    """Demonstrations on all four desks with pictures, converted with videos and CLIP embeddings."""
+    tasks = "--tasks=[turn_on_led,lift_red_block_table]"
+    run("lansar-record", "--output_dir=desk", tasks, "--scene=[A,B,C,D]", "--episodes=8")
     run(
         "lansar-convert", "--root=desk", "--split=training", "--repo_id=me/desk", "--output_dir=data",
         "--embed=true", "--clip.model=lansar-tiny", "--clip.pretrained=",
@@ -66,6 +67,12 @@ def lansar(run, dataset):
 def successes(work, folder):
     info = json.loads((work / folder / "eval_info.json").read_text())
     return [task["metrics"]["sum_rewards"] for task in info["per_task"]]
+
+
+def test_the_converted_recording_equals_what_was_recorded(run, dataset):
+    printed = run("lansar-verify", "--root=desk", "--repo_id=me/desk", "--dataset_dir=data", "--workers=2")
+    assert "8 episodes" in printed
+    assert printed.count("PSNR") == 2
 
 
 def test_lansar_evaluates_the_same_with_any_batch_size(run, work, lansar):

@@ -3,10 +3,14 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+from lerobot_lansar import executors
 
 OPTIONS = [
     "--cameras=[]", "--episodes=9", "--validation_episodes=1", "--tasks=[turn_on_led,open_drawer]", "--seed=5",
@@ -125,6 +129,24 @@ def test_ray_records_the_same(local, tmp_path):
     pytest.importorskip("ray", reason="needs the extra ray")
     record(tmp_path / "desk", "--executor=ray", "--workers=2")
     assert_same(local, tmp_path / "desk")
+
+
+def test_a_pool_that_hangs_after_a_worker_died_is_interrupted_until_it_ends(monkeypatch):
+    """Such a hang was seen once: a worker may be killed while it holds a lock of the pool."""
+    monkeypatch.setattr(executors, "_GRACE", 0.2)
+    pools = iter([[SimpleNamespace(pid=1, name="PoolWorker-1")]])
+    monkeypatch.setattr(executors.multiprocess, "active_children", lambda: next(pools, []))
+    interrupted = 0
+    with (
+        pytest.raises(executors.WorkerDied, match="a worker process was killed"),
+        executors._watched(lambda: 0, 1, "shard", "working"),
+    ):
+        try:
+            time.sleep(30)
+        except KeyboardInterrupt:
+            interrupted += 1
+            time.sleep(30)
+    assert interrupted == 1
 
 
 def test_slurm_jobs_convert_the_same(local, converted, slurm, tmp_path):
