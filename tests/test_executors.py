@@ -136,17 +136,19 @@ def test_a_pool_that_hangs_after_a_worker_died_is_interrupted_until_it_ends(monk
     monkeypatch.setattr(executors, "_GRACE", 0.2)
     pools = iter([[SimpleNamespace(pid=1, name="PoolWorker-1")]])
     monkeypatch.setattr(executors.multiprocess, "active_children", lambda: next(pools, []))
-    interrupted = 0
-    with (
-        pytest.raises(executors.WorkerDied, match="a worker process was killed"),
-        executors._watched(lambda: 0, 1, "shard", "working"),
-    ):
-        try:
-            time.sleep(30)
-        except KeyboardInterrupt:
-            interrupted += 1
-            time.sleep(30)
-    assert interrupted == 1
+    interrupted = []
+
+    def hang():
+        with executors._watched(lambda: 0, 1, "shard", "working"):
+            try:
+                time.sleep(30)
+            except KeyboardInterrupt:
+                interrupted.append(True)
+                time.sleep(30)
+
+    with pytest.raises(executors.WorkerDied, match="a worker process was killed"):
+        hang()
+    assert interrupted == [True]
 
 
 def test_slurm_jobs_convert_the_same(local, converted, slurm, tmp_path):
