@@ -355,6 +355,7 @@ class Video:
         if "x265-params" in options:  # it does not go through libav's log
             options["x265-params"] += ":log-level=error"
         stream: Any = self.container.add_stream(self._codec.name, FPS, options=options)
+        stream.codec_context.thread_count = 1  # workers share the cores; and the same bytes on every machine
         stream.pix_fmt = self._codec.pix_fmt
         stream.height, stream.width = picture.shape[:2]
         self.stream = stream
