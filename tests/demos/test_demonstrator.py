@@ -12,7 +12,7 @@ from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, TASKS, Desk, DeskError, SimulationError
 from lerobot_lansar.desk.starts import sample_start
 
-STARTS = 30
+STARTS, NEEDED = 30, 27
 
 
 def test_there_is_a_skill_for_every_task():
@@ -25,11 +25,13 @@ def test_unknown_tasks_are_refused():
 
 
 def successes(job):
-    """How many of the seeded random starts end in success."""
+    """How many of the seeded random starts end in success, counted until that is enough or can no longer be."""
     scene, assets, task = job
     count = 0
     with Desk(scene, assets, cameras=()) as desk:
         for k in range(STARTS):
+            if count == NEEDED or k - count > STARTS - NEEDED:
+                break
             try:
                 count += demonstrate(desk, task, np.random.default_rng([9, k])) is not None
             except SimulationError:
@@ -46,14 +48,14 @@ def rates(scene, assets=None):
 @pytest.mark.timeout(2400)
 @pytest.mark.parametrize("scene", SCENES)
 def test_every_task_succeeds_from_nine_of_ten_feasible_starts(scene):
-    assert {task: n for task, n in rates(scene).items() if n < 0.9 * STARTS} == {}
+    assert {task: n for task, n in rates(scene).items() if n < NEEDED} == {}
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 def test_every_task_succeeds_on_the_original_desk(original_assets):
     found = rates("D", str(original_assets))
-    assert {task: n for task, n in found.items() if n < 0.9 * STARTS} == {}
+    assert {task: n for task, n in found.items() if n < NEEDED} == {}
 
 
 @pytest.fixture(scope="module")
