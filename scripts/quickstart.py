@@ -93,6 +93,7 @@ def record_and_convert() -> None:
             "--split=training",
             "--repo_id=lansar/quickstart",
             "--images=none",
+            "--workers=2",
             f"--output_dir={DATA / 'lerobot'}",
         )
 
