@@ -19,7 +19,7 @@ BIN = Path(sys.executable).parent
 DATA = Path("data/quickstart")
 OUT = Path("outputs/quickstart")
 CONFIG = "configs/quickstart.yaml"
-COMMANDS = "scripts/quickstart_commands.yaml"
+COMMANDS = "scripts/commands.yaml"
 TASKS = [
     "open_drawer",
     "close_drawer",

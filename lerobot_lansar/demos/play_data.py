@@ -1,4 +1,5 @@
-"""Play: tasks follow each other without a reset, as in CALVIN's data, and language windows are cut from that."""
+"""Play: tasks follow each other without a reset, as in CALVIN's data. Language windows are cut from that: CALVIN's
+short ones around each fulfilled task, or whole subtasks, from the command to its fulfilment."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -11,7 +12,7 @@ from ..desk.oracle import DRAWER, PLANK, TABLE, Snapshot
 from ..desk.scenes import DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
 from ..desk.starts import REACH, TABLE_Z, beside_door, sample_start
 from .calvin_folder import FrameWriter, Unit
-from .demonstrator import MAX_STEPS, carry_out
+from .demonstrator import AFTERWARDS, MAX_STEPS, carry_out
 from .moves import Skill, Style, View, Waypoint, lying
 from .skills import SKILLS
 from .skills.blocks import put_down
@@ -20,11 +21,19 @@ WINDOW = 64
 """Frames in a language window at most (CALVIN)."""
 _SHORTEST = 32
 _PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each frame 1.58 times
+CHAIN = 5
+"""Subtasks in a chain (CALVIN's protocol): with whole windows a recording ends after so many, or a failed one."""
 _LATEST = 10  # frames after the fulfilment at which a window ends at the latest
 
 
 def record_play(
-    desk: Desk, frames: int, rng: np.random.Generator, writer: FrameWriter, noise: float, variety: float
+    desk: Desk,
+    frames: int,
+    rng: np.random.Generator,
+    writer: FrameWriter,
+    noise: float,
+    variety: float,
+    whole: bool = False,
 ) -> Unit:
     """Plays for ``frames`` control steps and writes all of them.
 
@@ -37,6 +46,7 @@ def record_play(
         rng: Decides everything.
         writer: Receives the frames.
         noise, variety: As for :func:`.demonstrator.demonstrate`.
+        whole: The windows are whole subtasks instead of CALVIN's.
 
     Returns:
         What was recorded: stretches between resets, and the windows with their tasks.
@@ -45,28 +55,38 @@ def record_play(
     while writer.frames < frames:
         start, snapshots, fulfilled = writer.frames, [], []
         try:
-            for frame, snapshot, done in _play(desk, frames - start, rng, noise, variety, unit):
+            for frame, snapshot, done in _play(desk, frames - start, rng, noise, variety, unit, whole):
                 writer.add(frame)
                 snapshots.append(snapshot)
                 if done is not None:
-                    fulfilled.append((len(snapshots) - 1, done))
+                    began, task = done
+                    fulfilled.append((began, len(snapshots) - 1, task))
         except SimulationError:
             pass
         if snapshots:
             unit.recordings.append((start, writer.frames))
-            for first, end, task in cut_windows(snapshots, fulfilled, rng):
+            cut = whole_windows(snapshots, fulfilled) if whole else cut_windows(snapshots, fulfilled, rng)
+            for first, end, task in cut:
                 unit.windows.append((start + first, start + end, task))
     unit.frames, unit.sums = writer.frames, writer.sums()
     return unit
 
 
 def _play(
-    desk: Desk, frames: int, rng: np.random.Generator, noise: float, variety: float, unit: Unit
-) -> Iterator[tuple[dict[str, np.ndarray], Snapshot, str | None]]:
-    """One uninterrupted recording. Yields each frame, its snapshot, and the task first seen fulfilled in it."""
+    desk: Desk,
+    frames: int,
+    rng: np.random.Generator,
+    noise: float,
+    variety: float,
+    unit: Unit,
+    whole: bool,
+) -> Iterator[tuple[dict[str, np.ndarray], Snapshot, tuple[int, str] | None]]:
+    """One uninterrupted recording. Yields each frame, its snapshot, and of the task first seen fulfilled in it the
+    frame in which it was begun and its name.
+    """
     obs = desk.reset(*sample_start(desk, str(rng.choice(list(TASKS))), rng))
     last, before = desk.snapshot(), None
-    left = frames
+    left, carried_out = frames, 0
     while left > 0:
         tasks = feasible_tasks(desk.scene, last, obs)
         skill: Skill
@@ -76,8 +96,8 @@ def _play(
             skill, oracle, before = SKILLS[task], TASKS[task], task
         else:
             task, skill, oracle = "", put_down, _never
-        start, done = last, False
-        rest = int(rng.integers(2, 20))
+        start, began, done = last, frames - left, False
+        rest = int(rng.integers(1, 6) if whole else rng.integers(2, 20))
         for moves, limit, stop in ((skill, MAX_STEPS, oracle), (_resting, rest, _never)):
             steps = carry_out(
                 desk,
@@ -92,11 +112,14 @@ def _play(
             for frame, after, now in steps:
                 first = not done and oracle(start, last)
                 done = done or first
-                yield frame, last, task if first else None
+                yield frame, last, (began, task) if first else None
                 obs, last, left = after, now, left - 1
         if done:
             unit.accepted[task] = unit.accepted.get(task, 0) + 1
+        carried_out += 1
         if any(block.position[2] < 0.30 for block in last.blocks.values()):
+            return
+        if whole and (not done or carried_out == CHAIN):
             return
 
 
@@ -198,14 +221,35 @@ def _under_another(snapshot: Snapshot, color: str) -> bool:
     return any(gap[2] > 0.03 and np.linalg.norm(gap[:2]) < 0.05 for gap in above)
 
 
+def whole_windows(
+    snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]]
+) -> list[tuple[int, int, str]]:
+    """Windows from the frame in which a task was begun until it is, and for some frames has been, fulfilled: what a
+    policy has to do in a rollout of several subtasks, from where the one before left the desk.
+
+    Args:
+        snapshots: Of each frame of one recording.
+        fulfilled: (began, frame, task): when tasks were begun and first seen fulfilled.
+
+    Returns:
+        (first, end, task) with an exclusive end, in order. Tasks that did not stay fulfilled give none.
+    """
+    return [
+        (began, frame + 1 + AFTERWARDS, task)
+        for began, frame, task in fulfilled
+        if frame + AFTERWARDS < len(snapshots)
+        and all(TASKS[task](snapshots[began], now) for now in snapshots[frame : frame + 1 + AFTERWARDS])
+    ]
+
+
 def cut_windows(
-    snapshots: list[Snapshot], fulfilled: list[tuple[int, str]], rng: np.random.Generator
+    snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]], rng: np.random.Generator
 ) -> list[tuple[int, int, str]]:
     """Windows of at most :data:`WINDOW` frames between whose first and last frame exactly one task was fulfilled.
 
     Args:
         snapshots: Of each frame of one recording.
-        fulfilled: (frame, task): when tasks were first seen fulfilled.
+        fulfilled: (began, frame, task): when tasks were begun and first seen fulfilled.
         rng: Decides where windows begin and end around these frames.
 
     Returns:
@@ -213,7 +257,7 @@ def cut_windows(
         or cannot be told from another one, give none.
     """
     windows = set()
-    for frame, task in fulfilled:
+    for _, frame, task in fulfilled:
         found = 0
         for attempt in range(8):
             latest = min(frame + 1 + _LATEST, len(snapshots))

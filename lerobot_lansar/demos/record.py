@@ -26,6 +26,7 @@ from .skills import SKILLS
 
 ATTEMPTS = 20
 SPLITS = ("training", "validation")
+MODES = ("windows", "play", "chains")
 STAGING = ".recording"
 SUBMITTED, PUBLISHING = "submitted", "publishing"  # marks in the staging folder
 SLURM_LOGS = ".recording-slurm"
@@ -39,7 +40,8 @@ class RecordConfig:
     output_dir: Path
     # One scene, or a list of them that share the recording evenly: --scene='[A,B,C]'.
     scene: list[str] | str = "D"
-    # windows: one episode for each command; play: tasks follow each other without a reset, windows are cut from it.
+    # windows: one command from a random start per episode; play: tasks follow each other without a reset, CALVIN's
+    # windows of at most 64 frames are cut from it; chains: play whose windows are whole subtasks.
     mode: str = "windows"
     # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
     tasks: list[str] = field(default_factory=lambda: list(SKILLS))
@@ -47,10 +49,10 @@ class RecordConfig:
     # of each task). Windows only.
     episodes: int = 100
     validation_episodes: int | None = None
-    # Hours of play in the training split, and in the validation split (a tenth by default). Play only.
+    # Hours of play or chains in the training split, and in the validation split (a tenth by default).
     hours: float = 1.0
     validation_hours: float | None = None
-    # Play is recorded in sessions of so many minutes; sessions are what workers share.
+    # Play and chains are recorded in sessions of so many minutes; sessions are what workers share.
     session_minutes: float = 2.0
     seed: int = 0
     # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
@@ -89,8 +91,8 @@ class RecordConfig:
                 raise DeskError(f"--scene: {scene!r} is none of {', '.join(SCENES)}")
         if not self.scenes or len(set(self.scenes)) != len(self.scenes):
             raise DeskError(f"--scene must name one scene, or different ones as '[A,B]', got {self.scene}")
-        if self.mode not in ("windows", "play"):
-            raise DeskError(f"--mode is windows or play, got {self.mode!r}")
+        if self.mode not in MODES:
+            raise DeskError(f"--mode is one of {', '.join(MODES)}, got {self.mode!r}")
         check_executor(self.executor, self.slurm)
         if not 0 <= self.variety <= 1:
             raise DeskError(f"--variety lies between 0 and 1, got {self.variety}")
@@ -114,9 +116,9 @@ class RecordConfig:
         """What decides the recorded data: everything but where it goes and who makes it."""
         without = {"output_dir", "workers", "executor", "slurm"}
         without |= (
-            {"tasks", "episodes", "validation_episodes"}
-            if self.mode == "play"
-            else {"hours", "validation_hours", "session_minutes"}
+            {"hours", "validation_hours", "session_minutes"}
+            if self.mode == "windows"
+            else {"tasks", "episodes", "validation_episodes"}
         )
         return {k: v for k, v in asdict(self).items() if k not in without}
 
@@ -137,7 +139,7 @@ class RecordConfig:
 
     def shard_size(self) -> int:
         """Units that one shard of work records; it depends on the request alone."""
-        return 1 if self.mode == "play" else max(4, sum(self.counts()) // 500)
+        return max(4, sum(self.counts()) // 500) if self.mode == "windows" else 1
 
 
 def record(config: RecordConfig) -> Path:
@@ -227,10 +229,10 @@ def record_unit(config: RecordConfig, index: int) -> None:
     seed = [config.seed, SPLITS.index(split), number]
     desk = _desk(scene, config.assets, tuple(config.cameras), config.renderer)
     with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene) as writer:
-        if config.mode == "play":
+        if config.mode != "windows":
             frames = config.session_frames(split)[number]
-            rng = np.random.default_rng(seed)
-            unit = record_play(desk, frames, rng, writer, config.noise, config.variety)
+            rng, whole = np.random.default_rng(seed), config.mode == "chains"
+            unit = record_play(desk, frames, rng, writer, config.noise, config.variety, whole)
         else:
             task = config.tasks[number % len(config.tasks)]
             demonstration, tried = _attempt(config, desk, task, seed)

@@ -1,11 +1,13 @@
 """Play: uninterrupted recordings, windows of at most 64 frames that hold one fulfilled task each."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from lerobot_lansar.demos.calvin_folder import group_by_scene
 from lerobot_lansar.demos.motion import relative_action
-from lerobot_lansar.demos.play_data import WINDOW, cut_windows, feasible_tasks
+from lerobot_lansar.demos.play_data import CHAIN, WINDOW, cut_windows, feasible_tasks
 from lerobot_lansar.demos.record import RecordConfig, record
 from lerobot_lansar.desk import CONTROL_HZ, TASKS, Desk, completed_tasks
 from lerobot_lansar.desk.starts import sample_start
@@ -106,7 +108,7 @@ def test_windows_end_after_the_task_and_name_no_other():
             desk.reset(scene_obs=state)
             snapshots.append(desk.snapshot())
     windows = cut_windows(
-        snapshots, [(70, "turn_on_led"), (120, "turn_on_lightbulb")], np.random.default_rng(0)
+        snapshots, [(50, 70, "turn_on_led"), (90, 120, "turn_on_lightbulb")], np.random.default_rng(0)
     )
     assert {task for *_, task in windows} == {"turn_on_led", "turn_on_lightbulb"}
     for first, end, task in windows:
@@ -118,3 +120,38 @@ def test_windows_end_after_the_task_and_name_no_other():
 def test_scenes_share_units_evenly_and_in_order():
     assert group_by_scene(["A", "B", "C"], 7) == ["A", "A", "A", "B", "B", "C", "C"]
     assert group_by_scene(["A", "B", "C"], 1) == ["A"]
+
+
+def test_windows_of_chains_are_whole_subtasks_that_follow_each_other(tmp_path):
+    folder = record(
+        RecordConfig(
+            tmp_path / "desk",
+            mode="chains",
+            hours=1.5 / 60,
+            validation_hours=0.1 / 60,
+            session_minutes=1.5,
+            cameras=[],
+        )
+    )
+    folder /= "training"
+    language = load(folder, "lang_annotations/auto_lang_ann.npy").item()
+    windows = list(zip(language["info"]["indx"], language["language"]["task"], strict=True))
+    bounds = load(folder, "ep_start_end_ids.npy")
+    assert len(windows) > 10
+    assert max(end - start for (start, end), _ in windows) > WINDOW
+    agreed = followed = 0
+    with Desk("D", cameras=()) as desk:
+        for (start, end), task in windows:
+            snapshots = []
+            for number in (start, end - 1):
+                frame = np.load(folder / f"episode_{number:07d}.npz")
+                desk.reset(frame["robot_obs"], frame["scene_obs"])
+                snapshots.append(desk.snapshot())
+            agreed += TASKS[task](*snapshots)
+    for first, last in bounds:
+        inside = [window for window, _ in windows if first <= window[0] and window[1] - 1 <= last]
+        assert len(inside) <= CHAIN
+        assert all(0 <= after[0] - before[1] < 6 for before, after in itertools.pairwise(inside))
+        followed += len(inside) > 1
+    assert followed > 0
+    assert agreed >= 0.85 * len(windows)  # as above

@@ -272,7 +272,7 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
     [
         ({"tasks": ["juggle"]}, "there is no task 'juggle'"),
         ({"scene": ["A", "A"]}, "--scene must name one scene, or different ones"),
-        ({"mode": "work"}, "--mode is windows or play"),
+        ({"mode": "work"}, "--mode is one of windows, play, chains"),
         ({"executor": "pigeon"}, "--executor is one of local, slurm, ray"),
         ({"variety": 2.0}, "--variety lies between 0 and 1"),
         ({"noise": -0.1}, "--noise lies between 0 and 0.5"),
