@@ -53,11 +53,11 @@ class LanSARConfig(PreTrainedConfig):
         window_start: which windows are trained on, see `windows.py`. "episode" = from the demonstration's
             start (thesis), "anywhere" = from the sampled frame, "mixed" = half of each.
         paraphrases: in training a window's command is replaced by a random one among the dataset's sentences for
-            the same CALVIN task (meta/calvin_source.json says which sentences those are).
+            the same CALVIN task (the dataset's column calvin.task).
         state_noise: in training the robot state (but not the last gripper action) is disturbed by normal noise of this
             standard deviation, in its own units, m and rad.
         contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out; those
-            of the same CALVIN task are not held against each other (meta/calvin_source.json).
+            of the same CALVIN task are not held against each other (the dataset's column calvin.task).
         ema_decay: the network that acts is a running average of the trained one with this decay; 0 = none.
         dtype: "float32", or "bfloat16" for mixed-precision training on a GPU that has it.
         smooth_l1_beta: beta of Eq 4.3, 4.4.

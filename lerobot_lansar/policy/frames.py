@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
+from lerobot.datasets.io_utils import load_tasks
 from tqdm import tqdm
 
 CACHE = ".cache/huggingface/lansar_frames"
@@ -22,6 +23,7 @@ CACHE = ".cache/huggingface/lansar_frames"
 
 COLUMNS = {"state": ("observation.state", 15), "environment_state": ("observation.environment_state", 24)}
 COLUMNS["action"] = ("action", 7)
+TASK_COLUMN = "calvin.task"
 CAMERAS = {"static": "observation.images.static", "gripper": "observation.images.gripper"}
 
 
@@ -186,21 +188,29 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
 def load_paraphrases(root: Path) -> dict[str, list[str]]:
     """For each of the dataset's sentences, all of its sentences for the same CALVIN task, itself included.
 
+    They come from the frames' own columns, so that datasets edited or merged by LeRobot's tools have them too.
+
     Raises:
-        ValueError: the dataset does not say which task an episode shows.
+        ValueError: the dataset does not say which task its frames show.
     """
-    file = Path(root) / "meta" / "calvin_source.json"
-    windows = (json.loads(file.read_text()).get("windows") if file.is_file() else None) or [{}]
-    if any(not {"task", "sentence"} <= window.keys() for window in windows):
-        raise ValueError(
-            f"--policy.paraphrases and --policy.contrastive_weight need task and sentence of every window in {file}, "
-            "as lansar-convert writes them: convert the dataset again, or train without."
+    pairs: set[tuple[int, int]] = set()
+    for path in data_files(root):
+        if TASK_COLUMN not in pq.read_schema(path).names:
+            raise ValueError(
+                f"--policy.paraphrases and --policy.contrastive_weight need to know which CALVIN task a sentence asks "
+                f"for; {path} has no column {TASK_COLUMN}, as lansar-convert writes it. Train without them."
+            )
+        columns = pq.read_table(path, columns=["task_index", TASK_COLUMN]).group_by(
+            ["task_index", TASK_COLUMN]
         )
-    by_task: dict[str, set[str]] = {}
-    by_sentence: dict[str, set[str]] = {}
-    for window in windows:
-        by_task.setdefault(window["task"], set()).add(window["sentence"])
-        by_sentence.setdefault(window["sentence"], set()).add(window["task"])
+        pairs.update(tuple(row.values()) for row in columns.aggregate([]).to_pylist())
+    sentences = load_tasks(Path(root)).reset_index().set_index("task_index")["task"]
+    by_task: dict[int, set[str]] = {}
+    by_sentence: dict[str, set[int]] = {}
+    for index, task in sorted(pairs):
+        if task >= 0:
+            by_task.setdefault(task, set()).add(sentences[index])
+            by_sentence.setdefault(sentences[index], set()).add(task)
     # a sentence that names two tasks keeps to sentences that do so too
     return {
         sentence: sorted(set.intersection(*(by_task[task] for task in tasks)))

@@ -57,8 +57,17 @@ def smooth_episode(rng: np.random.Generator, length: int) -> dict[str, np.ndarra
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
-def make_dataset(root: Path, form: str = "rel", lengths: tuple[int, ...] = LENGTHS, seed: int = 0):
-    """Write a LeRobotDataset without pictures; returns the episodes' arrays."""
+def make_dataset(
+    root: Path,
+    form: str = "rel",
+    lengths: tuple[int, ...] = LENGTHS,
+    seed: int = 0,
+    shown: tuple[tuple[int, str], ...] = (),
+):
+    """Write a LeRobotDataset without pictures; returns the episodes' arrays.
+
+    With `shown`, the number of each episode's CALVIN task and its sentence, it has the column calvin.task.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_lansar.policy.windows import ACTION_NAMES
@@ -71,6 +80,8 @@ def make_dataset(root: Path, form: str = "rel", lengths: tuple[int, ...] = LENGT
         "observation.environment_state": feature(24),
         "action": feature(7, ACTION_NAMES[form]),
     }
+    if shown:
+        features["calvin.task"] = {"dtype": "int64", "shape": (1,), "names": None}
     dataset = LeRobotDataset.create("test/desk", fps=30, features=features, root=root, use_videos=False)
     rng = np.random.default_rng(seed)
     episodes = [smooth_episode(rng, length) for length in lengths]
@@ -80,8 +91,10 @@ def make_dataset(root: Path, form: str = "rel", lengths: tuple[int, ...] = LENGT
                 "observation.state": episode["state"][t],
                 "observation.environment_state": episode["environment"][t],
                 "action": episode[form][t],
-                "task": COMMANDS[i % len(COMMANDS)],
+                "task": shown[i][1] if shown else COMMANDS[i % len(COMMANDS)],
             }
+            if shown:
+                frame["calvin.task"] = np.array([shown[i][0]])
             dataset.add_frame(frame)
         dataset.save_episode()
     dataset.finalize()

@@ -1,6 +1,5 @@
 """The policy as LeRobot drives it: loss, histories, actions, checkpoints, errors."""
 
-import json
 import math
 
 import numpy as np
@@ -420,9 +419,7 @@ def test_mixed_precision_changes_neither_what_is_kept_nor_what_is_decided():
 
 
 def test_options_of_training_change_training_only(tmp_path):
-    make_dataset(tmp_path / "data", "rel")
-    episodes = [{"task": command, "sentence": command} for command in COMMANDS]
-    (tmp_path / "data" / "meta" / "calvin_source.json").write_text(json.dumps({"windows": episodes}))
+    make_dataset(tmp_path / "data", "rel", shown=tuple(enumerate(COMMANDS)))
     config = small_config(
         dropout=0.0, mlp_norm="layer", state_noise=0.01, contrastive_weight=0.5, paraphrases=True,
         egocentric_blocks=True,
