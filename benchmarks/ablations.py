@@ -1,13 +1,19 @@
 """Which of LanSAR's options earn their place: same demonstrations and updates, several seeds, official chains.
 
-    lansar-record --scene=D --episodes=10000 --cameras='[]' --workers=2 --output_dir=data/desk_D
-    lansar-convert --root=data/desk_D --split=training --repo_id=lansar/desk_D --images=none \
-        --output_dir=data/desk_D_lerobot
-    python benchmarks/ablations.py --root=data/desk_D_lerobot [--variants='[recommended,euler angles]']
+    SAY="--annotations=scripts/commands.yaml --validation_annotations=scripts/commands.yaml --cameras=[] --workers=2"
+    lansar-record $SAY --episodes=6460 --validation_episodes=100 --output_dir=data/desk_D
+    lansar-record $SAY --mode=chains --hours=4 --validation_hours=0.1 --seed=1 --output_dir=data/desk_D_chains
+    for name in desk_D desk_D_chains; do lansar-convert --root=data/$name --split=training --repo_id=lansar/$name \
+        --images=none --workers=2 --output_dir=data/${name}_lerobot; done
+    lerobot-edit-dataset --new_repo_id=lansar/desk_D_all --new_root=data/desk_D_all_lerobot --operation.type=merge \
+        --operation.repo_ids='[lansar/desk_D, lansar/desk_D_chains]' \
+        --operation.roots='[data/desk_D_lerobot, data/desk_D_chains_lerobot]'
+    python benchmarks/ablations.py --root=data/desk_D_all_lerobot [--variants='[recommended,euler angles]']
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
 Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
-desk. What is in --output_dir is not done again. Prints a Markdown table; --output_dir/results.json holds every run.
+desk, both with the sentences of scripts/commands.yaml. What is in --output_dir is not done again. Prints a Markdown
+table; --output_dir/results.json holds every run.
 """
 
 import hashlib
@@ -24,11 +30,13 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import yaml
 from filelock import FileLock
 from tqdm import tqdm
 
 from lerobot_lansar.policy.frames import dataset_fingerprint
 
+COMMANDS = Path(__file__).parents[1] / "scripts/commands.yaml"
 ACHIEVED = ["--policy.target=achieved"]
 THESIS_RULES = [
     "--policy.position_scale_start=3",
@@ -49,9 +57,18 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "windows from anywhere": (["--policy.window_start=anywhere"], []),
     "contrastive loss, weight 0.1": (["--policy.contrastive_weight=0.1"], []),
     "noise on the state, 3 mm and 3 mrad": (["--policy.state_noise=0.003"], []),
-    "paraphrases": (["--policy.paraphrases=true"], []),
     "averaged weights, decay 0.998": (["--policy.ema_decay=0.998"], []),
     "window slides by 1": ([], ["--policy.window_slide=1"]),
+    "windows of 64 steps, 24 a batch": (
+        ["--policy.window=64", "--policy.window_slide=32", "--batch_size=24"],
+        [],
+    ),
+    "windows of 8 steps, 192 a batch": (
+        ["--policy.window=8", "--policy.window_slide=4", "--batch_size=192"],
+        [],
+    ),
+    "hidden 128, feedforward 512": (["--policy.hidden=128", "--policy.feedforward=512"], []),
+    "learning rate 0.002": (["--policy.learning_rate=0.002"], []),
 }
 """Name -> options of training and of evaluation, on top of the configuration file. Same training, same checkpoint."""
 
@@ -61,7 +78,7 @@ class Options:
     """What to run."""
 
     root: Path
-    config: Path = Path("configs/lansar_small.yaml")
+    config: Path = Path("configs/lansar.yaml")
     variants: list[str] = field(default_factory=lambda: list(VARIANTS))
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
     updates: int = 3000
@@ -98,7 +115,9 @@ def key(*parts: Any) -> str:
 def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]:
     """The checkpoint of one training and the minutes it took; done once, whoever asks first."""
     frames = dataset_fingerprint(options.root)
-    folder = options.output_dir / key(options.config.read_text(), frames, options.updates, changes, seed)
+    folder = options.output_dir / key(
+        yaml.safe_load(options.config.read_text()), frames, options.updates, changes, seed
+    )
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, minutes = folder / "train/checkpoints/last/pretrained_model", folder / "minutes.json"
     with FileLock(folder / ".lock"):
@@ -123,8 +142,9 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
         log = folder.with_suffix(".log")
         command(
             "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=calvin", "--env.control_mode=abs",
-            "--env.cameras=[]", "--env.render_fps=1", f"--env.results_dir={folder}", *evaluation,
-            f"--eval.n_episodes={options.chains}", "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
+            "--env.cameras=[]", f"--env.annotations={COMMANDS}", "--env.render_fps=1",
+            f"--env.results_dir={folder}", *evaluation, f"--eval.n_episodes={options.chains}",
+            "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
             f"--output_dir={folder}", log=log,
         )  # fmt: skip
         command("lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
