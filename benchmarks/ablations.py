@@ -37,6 +37,10 @@ from tqdm import tqdm
 from lerobot_lansar.policy.frames import dataset_fingerprint
 
 COMMANDS = Path(__file__).parents[1] / "scripts/commands.yaml"
+UNTRAINED_CLIP = ["--policy.clip.model=lansar-tiny", "--policy.clip.pretrained="]
+"""Nothing to download; it tells the few sentences of COMMANDS apart."""
+RUN = ("steps", "save_freq", "log_freq", "seed")
+"""What every run decides for itself, whatever the configuration file says."""
 ACHIEVED = ["--policy.target=achieved"]
 THESIS_RULES = [
     "--policy.position_scale_start=3",
@@ -126,7 +130,8 @@ def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]
             seconds = command(
                 "lerobot-train", f"--config_path={options.config}", "--dataset.repo_id=lansar/ablations",
                 f"--dataset.root={options.root}", f"--output_dir={folder / 'train'}", f"--seed={seed}",
-                f"--steps={options.updates}", f"--save_freq={options.updates}", *changes, log=folder / "train.log",
+                f"--steps={options.updates}", f"--save_freq={options.updates}", *UNTRAINED_CLIP, *changes,
+                log=folder / "train.log",
             )  # fmt: skip
             minutes.write_text(json.dumps(seconds / 60))
         return checkpoint, json.loads(minutes.read_text())
