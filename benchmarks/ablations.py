@@ -118,10 +118,9 @@ def key(*parts: Any) -> str:
 
 def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]:
     """The checkpoint of one training and the minutes it took; done once, whoever asks first."""
+    config = {k: v for k, v in yaml.safe_load(options.config.read_text()).items() if k not in RUN}
     frames = dataset_fingerprint(options.root)
-    folder = options.output_dir / key(
-        yaml.safe_load(options.config.read_text()), frames, options.updates, changes, seed
-    )
+    folder = options.output_dir / key(config, frames, options.updates, changes, seed)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, minutes = folder / "train/checkpoints/last/pretrained_model", folder / "minutes.json"
     with FileLock(folder / ".lock"):
