@@ -42,7 +42,7 @@ class LanSARConfig(PreTrainedConfig):
         use_images: static and gripper picture (CLIP embeddings) are part of the context.
         use_spatial_context: robot, block and scene state are part of the context (the decoder always sees the
             robot).
-        command_in_context: the command is also a token of the context.
+        command_in_context: the command is also a token of the context, and CLS asks with it which of the others matter.
         command_prepended: the command stands once at the front instead of before every step (Table 5.3).
         orientation: how euler angles enter the network. "euler" as they are, "sincos" without the +-pi jump
             (the gripper's roll sits there). Predicted are wrapped differences either way.

@@ -47,7 +47,8 @@ class NetworkConfig:
         use_images: tokens I and G take part in the context.
         use_spatial_context: tokens X, B (x3) and S take part in the context (the decoder's target keeps X
             anyway).
-        command_in_context: the command is one more context token (section 6.5.1).
+        command_in_context: the command is one more context token (section 6.5.1), and CLS asks with it: what E_t
+            keeps of a timestep depends on the command already in the first context layer.
         command_prepended: C stands once at the front of memory and target instead of before every step (Table
             5.3).
         contrastive: `forward` also returns a contrastive loss between commands and windows (section 6.5.1).
@@ -397,6 +398,8 @@ class LanSARNetwork(nn.Module):
         """
         tokens = [self.cls.weight.expand(len(modalities), 1, -1), modalities]
         if self.config.command_in_context:
+            # A token alone cannot change which of the others CLS attends to in a single layer; its query can.
+            tokens[0] = tokens[0] + command[:, None]
             tokens.append(command[:, None])
         x = torch.cat(tokens, dim=1) + self.context_position.weight  # (N, k, h)
         for i, layer in enumerate(self.context_layers):

@@ -170,6 +170,23 @@ def test_a_context_sees_the_command_only_when_asked_to():
         assert (gradient is not None) == in_context == ("C" in network.context_tokens)
 
 
+def test_the_command_decides_which_block_a_single_context_layer_looks_at():
+    inputs = windows(TINY, [1])
+    for in_context in (False, True):
+        network = build(command_in_context=in_context, context_layers=1).eval()
+        tokens = network.modalities(
+            *(inputs[name][0] for name in ("state", "blocks", "scene", "static", "gripper"))
+        )
+        shares = []
+        for command in torch.randn(2, 1, TINY.hidden):
+            with recorded_attention(network.context_layers) as seen:
+                network.encode_context(tokens, command)
+            (weights,) = seen["0.attention"]
+            red, blue = (network.context_tokens.index(f"B_{color}") for color in ("red", "blue"))
+            shares.append(weights[0, :, 0, red] / weights[0, :, 0, blue])
+        assert torch.allclose(*shares) != in_context
+
+
 def test_a_prepended_command_stands_once_at_the_front():
     steps, command = torch.ones(1, 3, TINY.hidden), torch.zeros(1, TINY.hidden)
     kinds = {
