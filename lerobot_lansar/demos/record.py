@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import draccus
 import numpy as np
@@ -46,7 +47,7 @@ class RecordConfig:
     # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
     tasks: list[str] = field(default_factory=lambda: list(SKILLS))
     # Accepted demonstrations in the training split, and in the validation split (a tenth by default, and at least one
-    # of each task). Windows only.
+    # of each task in each scene). Windows only.
     episodes: int = 100
     validation_episodes: int | None = None
     # Hours of play or chains in the training split, and in the validation split (a tenth by default).
@@ -75,7 +76,8 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         if self.validation_episodes is None:
-            self.validation_episodes = max(len(set(self.tasks)), round(self.episodes / 10))
+            least = len(set(self.tasks)) * len(self.scenes)
+            self.validation_episodes = max(least, round(self.episodes / 10))
         if self.validation_hours is None:
             self.validation_hours = self.hours / 10
 
@@ -106,6 +108,10 @@ class RecordConfig:
         for name, minutes in (("hours", 60), ("validation_hours", 60), ("session_minutes", 1)):
             if not 0.1 <= getattr(self, name) * minutes <= 1e6:
                 raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
+        if self.mode != "windows" and self.tasks != list(SKILLS):
+            raise DeskError(
+                f"--tasks goes with --mode=windows; --mode={self.mode} carries out whatever is feasible"
+            )
 
     @property
     def scenes(self) -> list[str]:
@@ -225,31 +231,41 @@ def record_shard(config: RecordConfig, shard: int) -> None:
 
 def record_unit(config: RecordConfig, index: int) -> None:
     """Records one episode (the first accepted one of its attempts) or one session of play."""
-    split, number, scene = place_of_unit(config, index)
-    seed = [config.seed, SPLITS.index(split), number]
-    desk = _desk(scene, config.assets, tuple(config.cameras), config.renderer)
+    place = place_of_unit(config, index)
+    seed = [config.seed, SPLITS.index(place.split), place.number]
+    desk = _desk(place.scene, config.assets, tuple(config.cameras), config.renderer)
     with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene) as writer:
         if config.mode != "windows":
-            frames = config.session_frames(split)[number]
+            frames = config.session_frames(place.split)[place.number]
             rng, whole = np.random.default_rng(seed), config.mode == "chains"
             unit = record_play(desk, frames, rng, writer, config.noise, config.variety, whole)
         else:
-            task = config.tasks[number % len(config.tasks)]
+            task = config.tasks[place.in_scene % len(config.tasks)]
             demonstration, tried = _attempt(config, desk, task, seed)
             n = len(demonstration)
             for t in range(n):
                 writer.add({key: values[t] for key, values in demonstration.frames.items()})
-            unit = Unit(scene, n, [(0, n)], [(0, n, task)], {task: tried}, {task: 1}, writer.sums())
+            unit = Unit(place.scene, n, [(0, n)], [(0, n, task)], {task: tried}, {task: 1}, writer.sums())
     unit.save(_note(config, index))
 
 
-def place_of_unit(config: RecordConfig, index: int) -> tuple[str, int, str]:
-    """Split, number within it and scene of a unit; in each split the units of a scene follow each other."""
+class Place(NamedTuple):
+    """Where a unit belongs: its number within the split, and within the units of its scene there."""
+
+    split: str
+    number: int
+    scene: str
+    in_scene: int
+
+
+def place_of_unit(config: RecordConfig, index: int) -> Place:
+    """Of any unit of both splits; in each split the units of a scene follow each other, and so do the tasks in each
+    scene, so that every scene gets every task."""
     training, validation = config.counts()
-    if index < training:
-        return "training", index, group_by_scene(config.scenes, training)[index]
-    number = index - training
-    return "validation", number, group_by_scene(config.scenes, validation)[number]
+    split, count = ("training", training) if index < training else ("validation", validation)
+    number = index if index < training else index - training
+    scenes = group_by_scene(config.scenes, count)
+    return Place(split, number, scenes[number], number - scenes.index(scenes[number]))
 
 
 def _attempt(config: RecordConfig, desk: Desk, task: str, seed: list[int]) -> tuple[Demonstration, int]:
@@ -294,7 +310,7 @@ def publish(config: RecordConfig, kind: str, _: int) -> None:
     ):
         commands = load_commands(_annotations(config, split), split)
         rows = [
-            (staging / f"{index:06d}", units[index], _say(commands, units[index], config.seed, index))
+            (staging / f"{index:06d}", units[index], _say(commands, units[index], config, index))
             for index in indices
         ]
         shutil.rmtree(output / split, ignore_errors=True)  # of a try that ended between the two
@@ -303,9 +319,10 @@ def publish(config: RecordConfig, kind: str, _: int) -> None:
     print(summary(config, units))
 
 
-def _say(commands: dict[str, list[str]], unit: Unit, seed: int, index: int) -> list[str]:
+def _say(commands: dict[str, list[str]], unit: Unit, config: RecordConfig, index: int) -> list[str]:
     """A random sentence for each of a unit's windows."""
-    rng = np.random.default_rng([seed, index, ATTEMPTS])
+    place = place_of_unit(config, index)
+    rng = np.random.default_rng([config.seed, SPLITS.index(place.split), place.number, ATTEMPTS])
     return [commands[task][int(rng.integers(len(commands[task])))] for *_, task in unit.windows]
 
 

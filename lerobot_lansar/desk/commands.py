@@ -2,7 +2,8 @@
 
 A task's sentences come in two sets that share none: *training* ones, with which demonstrations are labelled, and
 *validation* ones, held out for evaluation, as CALVIN does it. They start from the example commands in Table 4.1 of the
-thesis. Colour, direction and place are filled in from the task's name, so they cannot be wrong.
+thesis. Colour and direction are filled in from the task's name; that place words and opposites (open, close; on, off)
+are right is tested.
 """
 
 import itertools

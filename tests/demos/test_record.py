@@ -8,10 +8,12 @@ import time
 
 import numpy as np
 import pytest
+import yaml
 
 import lerobot_lansar.demos.record as record_module
 from lerobot_lansar.demos.motion import relative_action
-from lerobot_lansar.demos.record import RecordConfig, record
+from lerobot_lansar.demos.record import SPLITS, RecordConfig, place_of_unit, record
+from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, DeskError
 from lerobot_lansar.desk.commands import COMMANDS
 from lerobot_lansar.executors import WorkerDied
@@ -77,10 +79,69 @@ def test_rel_actions_follow_from_actions_and_robot_obs(recording):
         np.testing.assert_allclose(frame["robot_obs"][:3] + moved, frame["actions"][:3], atol=1e-9)
 
 
-def test_two_workers_record_the_same_as_one(recording, tmp_path):
-    other = record(options(tmp_path / "desk", workers=2))
+def same_folders(a, b):
+    """Frames, bounds, scenes, statistics, windows and sentences of both splits."""
     for split in ("training", "validation"):
-        assert same(frames(other / split), frames(recording / split))
+        assert same(frames(a / split), frames(b / split))
+        files = [{f.relative_to(x / split) for f in (x / split).rglob("*")} for x in (a, b)]
+        assert files[0] == files[1]
+        for name in files[0]:
+            one, other = a / split / name, b / split / name
+            if one.suffix != ".npz" and one.is_file():
+                assert one.read_bytes() == other.read_bytes(), name
+    return True
+
+
+def test_two_workers_record_the_same_as_one(recording, tmp_path):
+    assert same_folders(record(options(tmp_path / "desk", workers=2)), recording)
+
+
+@pytest.mark.parametrize("mode", ["play", "chains"])
+def test_two_workers_play_the_same_as_one(mode, tmp_path):
+    minutes = {"mode": mode, "hours": 0.5 / 60, "validation_hours": 0.25 / 60, "session_minutes": 0.25}
+    minutes |= {"tasks": list(SKILLS), "cameras": ["static"], "scene": ["A", "B"]}
+    one = record(options(tmp_path / "one", **minutes))
+    assert same_folders(record(options(tmp_path / "two", **minutes, workers=2)), one)
+    sentences = np.load(one / "training/lang_annotations/auto_lang_ann.npy", allow_pickle=True).item()
+    assert sentences["language"]["ann"]
+
+
+def test_every_scene_gets_every_task(tmp_path):
+    config = options(tmp_path / "desk", scene=["A", "B", "C"], episodes=12, validation_episodes=None)
+    config = RecordConfig(**{**vars(config), "validation_episodes": None})
+    assert config.validation_episodes == 6
+    training, validation = config.counts()
+    places = [place_of_unit(config, index) for index in range(training + validation)]
+    found = {split: [(p.scene, p.in_scene % 2) for p in places if p.split == split] for split in SPLITS}
+    assert {pair: found["training"].count(pair) for pair in found["training"]} == {
+        (scene, task): 2 for scene in "ABC" for task in (0, 1)
+    }
+    assert sorted(found["validation"]) == [(scene, task) for scene in "ABC" for task in (0, 1)]
+
+
+def test_demonstrations_on_the_original_desk_look_like_it(original_assets, tmp_path):
+    made = {}
+    for assets in (None, str(original_assets)):
+        made[assets] = record(
+            options(
+                tmp_path / f"desk_{assets is None}",
+                tasks=["open_drawer"],
+                episodes=1,
+                validation_episodes=1,
+                cameras=["static", "gripper"],
+                assets=assets,
+                renderer="fast_gl",
+            )
+        )
+        config = yaml.safe_load((made[assets] / "training/.hydra/merged_config.yaml").read_text())
+        assert config["assets_used"] == ("original" if assets else "built-in")
+        shown = list(frames(made[assets] / "training").values())
+        assert shown[0]["rgb_static"].shape == (200, 200, 3)
+        assert shown[0]["rgb_gripper"].shape == (84, 84, 3)
+        drawer = [frame["scene_obs"][1] for frame in shown]
+        assert drawer[-1] - drawer[0] > 0.12
+    first = [next(iter(frames(folder / "training").values())) for folder in made.values()]
+    assert np.abs(first[0]["rgb_static"].astype(int) - first[1]["rgb_static"]).mean() > 10
 
 
 def test_blocks_go_to_disk_in_the_scenes_original_order(tmp_path):
@@ -226,6 +287,9 @@ def test_validation_is_not_a_part_of_a_longer_training(tmp_path):
     assert not any(np.array_equal(held_out, start) for start in starts(long / "training"))
     assert np.array_equal(starts(short / "training")[0], starts(long / "training")[0])
     assert np.array_equal(starts(short / "validation")[0], starts(long / "validation")[0])
+    said = [x / "validation/lang_annotations/auto_lang_ann.npy" for x in (short, long)]
+    one, other = (np.load(file, allow_pickle=True).item()["language"]["ann"] for file in said)
+    assert one == other
 
 
 def starts(folder):
@@ -282,6 +346,7 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
         ({"validation_annotations": "nowhere.yaml"}, "--validation_annotations: annotations file"),
         ({"seed": -1}, "--seed must be 0 or more"),
         ({"scene": "D_eval"}, "--scene: 'D_eval' is none of A, B, C, D"),
+        ({"mode": "play"}, "--tasks goes with --mode=windows"),
         ({"scene": "E"}, "--scene: 'E' is none of A, B, C, D"),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"cameras": ["wrist"]}, "camera 'wrist'"),

@@ -34,6 +34,26 @@ def test_colours_and_sides_are_those_of_the_task():
             assert sentence == " ".join(sentence.split())
 
 
+OPPOSITES = ({"open", "pull"}, {"close", "shut"}), ({"on"}, {"off"})
+PLACES = {"table": {"table"}, "slider": {"cabinet", "shelf", "door"}, "drawer": {"drawer"}}
+
+
+def test_places_and_opposites_are_those_of_the_task():
+    """lift_* and place_* name their own place and no other (a block on the table may go without); open, close, on
+    and off tasks not the opposite."""
+    for split, task in itertools.product(COMMANDS, TASKS):
+        for sentence in COMMANDS[split][task]:
+            spoken = set(sentence.replace(",", "").split())
+            if task.startswith(("lift_", "place_")):
+                place = task.rsplit("_", 1)[-1]
+                named = {p for p, names in PLACES.items() if spoken & names}
+                assert named == {place} or (place == "table" and not named), (task, sentence)
+            words = set(task.split("_"))
+            for one, other in (pair for a, b in OPPOSITES for pair in ((a, b), (b, a))):
+                if words & one and not task.startswith(("lift_", "place_")):
+                    assert not spoken & other, (task, sentence)
+
+
 def test_patterns_expand_to_every_choice():
     assert set(expand("a (b|c (d|)) e")) == {"a b e", "a c d e", "a c e"}
     assert expand("(x|y) (|z)") == ["x", "x z", "y", "y z"]
