@@ -1,14 +1,10 @@
-"""Which of LanSAR's options earn their place: same demonstrations and updates, several seeds, official chains.
+r"""Which of LanSAR's options earn their place: same demonstrations and updates, several seeds, official chains.
 
-    SAY="--annotations=scripts/commands.yaml --validation_annotations=scripts/commands.yaml --cameras=[] --workers=2"
-    lansar-record $SAY --episodes=6460 --validation_episodes=100 --output_dir=data/desk_D
-    lansar-record $SAY --mode=chains --hours=4 --validation_hours=0.1 --seed=1 --output_dir=data/desk_D_chains
-    for name in desk_D desk_D_chains; do lansar-convert --root=data/$name --split=training --repo_id=lansar/$name \
-        --images=none --workers=2 --output_dir=data/${name}_lerobot; done
-    lerobot-edit-dataset --new_repo_id=lansar/desk_D_all --new_root=data/desk_D_all_lerobot --operation.type=merge \
-        --operation.repo_ids='[lansar/desk_D, lansar/desk_D_chains]' \
-        --operation.roots='[data/desk_D_lerobot, data/desk_D_chains_lerobot]'
-    python benchmarks/ablations.py --root=data/desk_D_all_lerobot [--variants='[recommended,euler angles]']
+    lansar-record --annotations=scripts/commands.yaml --validation_annotations=scripts/commands.yaml --cameras='[]' \
+        --mode=chains --hours=8 --validation_hours=0.2 --variety=0.3 --seed=0 --workers=2 --output_dir=data/chains
+    lansar-convert --root=data/chains --split=training --repo_id=lansar/chains --images=none --workers=2 \
+        --output_dir=data/chains_lerobot
+    python benchmarks/ablations.py --root=data/chains_lerobot [--variants='[recommended,euler angles]']
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
 Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in

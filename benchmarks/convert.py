@@ -21,7 +21,7 @@ import draccus
 import numpy as np
 from tqdm import tqdm
 
-from dataset_convert.calvin import TASKS, CalvinSplit
+from dataset_convert.calvin import TASKS, CalvinSplit, load_object_array
 from dataset_convert.features import dataset_features, pictures_of
 from dataset_convert.writer import RGBEncoder
 
@@ -126,7 +126,7 @@ def repeated(root: Path, times: int, target: Path) -> None:
         if file.is_file():
             (training / file.name).symlink_to(file.resolve())
     name = "lang_annotations/auto_lang_ann.npy"
-    listed = np.load(root / "training" / name, allow_pickle=True).item()
+    listed = load_object_array(root / "training" / name)
     for part, keys in (("language", ("ann", "task")), ("info", ("indx",))):
         for key in keys:
             listed[part][key] = list(listed[part][key]) * times

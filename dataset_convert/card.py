@@ -5,6 +5,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from dataset_convert.calvin import COLOURS
+
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
 
@@ -30,7 +34,10 @@ def write(root: Path, repo_id: str) -> None:
     from lerobot.datasets.utils import create_lerobot_dataset_card
 
     card = create_lerobot_dataset_card(dataset_info=load_info(root), repo_id=repo_id, **fields(root, repo_id))
-    card.save(root / "README.md")
+    # In a hub download README.md is a link into the cache: writing would follow the link, renaming replaces it.
+    partial = root / ".README.md.partial"
+    card.save(partial)
+    partial.rename(root / "README.md")
 
 
 def fields(root: Path, repo_id: str) -> dict[str, Any]:
@@ -88,16 +95,19 @@ def describe(
   `{request["source_sha256"]}`, converted with lerobot_policy_lansar {manifest["versions"]["lerobot_policy_lansar"]}.
   Every frame was checked: finite, of the right shape and type, relative actions equal to what absolute actions and
   states imply, no frame missing. `meta/calvin_source.json` has a SHA-256 of every episode's source frames and of every
-  file; `lansar-verify` compares this dataset with its source.
+  file in `data`, `videos` and `meta` but itself; `lansar-verify` compares this dataset with its source.
 * **Windows** end before their last number, as in CALVIN.{_windows(manifest, used)}
 * **Scenes:** {scenes}. Blocks are always red, blue, pink here.
-* **Left out:** {_left_out(manifest)}
 * **Privileged state:** `observation.environment_state` is the simulator's own state (block poses, joints,
   lights). A real robot does not have it; results of policies that read it must say so.
 {_clip(clip)}
 | task | windows |
 | --- | ---: |
 {tasks}
+
+### Known defects
+
+{_defects(manifest)}
 
 ### Train and evaluate
 
@@ -135,17 +145,48 @@ def _windows(manifest: dict[str, Any], used: list[dict[str, Any]]) -> str:
     return f"{kept} No two windows {what}share a frame (`--dedup={request['dedup']}`)."
 
 
-def _left_out(manifest: dict[str, Any]) -> str:
-    text = (
-        f"{len(manifest['left_out'])} defective episodes."
-        if manifest["left_out"]
-        else "no defective episode."
+def _defects(manifest: dict[str, Any]) -> str:
+    return "\n".join(f"* {text}" for text in (_shared(manifest), _colours(manifest), _left_out(manifest)))
+
+
+def _shared(manifest: dict[str, Any]) -> str:
+    shared = manifest["shared_frames"]
+    if manifest["request"]["split"] != "training":
+        return "**Frames in both splits:** the card of the training split lists them."
+    if not shared:
+        return "**Frames in both splits:** none found (they are looked for if `training/` and `validation/` are there)."
+    here = sum(any(e["start"] <= frame < e["end"] for e in manifest["episodes"]) for frame in shared)
+    frames = ", ".join(map(str, shared[:10])) + (f" and {len(shared) - 10} more" if len(shared) > 10 else "")
+    return f"**Frames in both splits:** training and validation share {frames}; in episodes here: {here or 'none'}."
+
+
+def _colours(manifest: dict[str, Any]) -> str:
+    """What the lifting windows say: the block that rises should be the one that the task names."""
+    total, wrong, wrongs = 0, 0, []
+    for letter, scene in manifest["scenes"].items():
+        votes = np.array(manifest["block_votes"][letter])
+        total += int(votes.sum())
+        for named, row in zip(COLOURS, votes.tolist(), strict=True):
+            for risen, count in zip(scene["block_order"], row, strict=True):
+                if count and risen != named:
+                    wrong += count
+                    wrongs.append(f"{count} × {risen} instead of {named} in scene {letter}")
+    found = f"except in {wrong} ({', '.join(wrongs)}), which are here as annotated" if wrong else "in all"
+    return (
+        f"**Wrong colours:** {total} annotated windows of the split lift a block, by `scene_obs`. It is the one that "
+        f"the task names {found}. Other tasks than `lift_…` were not examined."
     )
-    if manifest["shared_frames"]:
-        what = "were left out" if manifest["request"]["exclude_shared"] else "are still here"
-        frames = ", ".join(str(frame) for frame in manifest["shared_frames"][:10])
-        text += f" Frames that training and validation share {what}: {frames}."
-    return text
+
+
+def _left_out(manifest: dict[str, Any]) -> str:
+    bad = manifest["left_out"]
+    if not bad:
+        return "**Left out:** no defective episode."
+    first = "; ".join(f"frames {e['start']}-{e['end'] - 1}: {e['reason']}" for e in bad[:5])
+    return (
+        f"**Left out:** {len(bad)} defective episodes, all in `left_out` of `meta/calvin_source.json` "
+        f"({first}{'; …' if len(bad) > 5 else ''})."
+    )
 
 
 def _clip(clip: dict[str, Any] | None) -> str:
@@ -153,7 +194,8 @@ def _clip(clip: dict[str, Any] | None) -> str:
         return ""
     return (
         f"* **CLIP embeddings** of both cameras' pictures: `clip/*.npy`, float16 by absolute `index`, of open_clip's\n"
-        f"  {clip['model']} {clip['pretrained'] or 'untrained'}, SHA-256 of its weights `{clip['weights_sha256']}`.\n"
+        f"  {clip['model']} {clip['pretrained'] or 'untrained'}, SHA-256 of its weights `{clip['weights_sha256']}`;\n"
+        "  `clip/clip.json` has a SHA-256 of both arrays.\n"
     )
 
 

@@ -1,12 +1,13 @@
 """What must hold of CALVIN data before it is converted: finite numbers, consistent actions, known block
 columns."""
 
+from collections.abc import Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
 
 import numpy as np
 
-from dataset_convert.calvin import COLOURS, CalvinSplit
+from dataset_convert.calvin import COLOURS, VECTORS, CalvinSplit
 
 POSITION_STEP = 0.02
 """Metres that a relative action of 1 stands for."""
@@ -54,18 +55,26 @@ def relative_actions(actions: np.ndarray, robot_obs: np.ndarray) -> np.ndarray:
     return np.concatenate([np.clip(position, -1, 1), np.clip(rotation, -1, 1), actions[:, 6:]], axis=1)
 
 
-def check_frames(columns: dict[str, np.ndarray], frames: range, split: CalvinSplit) -> None:
-    """Checks consecutive frames; shapes and dtypes were checked when they were read.
+def check_frames(
+    columns: dict[str, np.ndarray],
+    frames: Sequence[int],
+    split: CalvinSplit,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> None:
+    """Checks frames; shapes and dtypes were checked when they were read.
 
     Args:
         columns: the frames' vectors and, if any, distances, each (n, …); colours are left alone.
         frames: their n numbers.
         split: names the files.
+        limits: array -> smallest and largest distance (m) that its depth video can hold.
 
     Raises:
-        ValueError: a number is not finite, a gripper command is neither -1 nor 1, or a relative action is not
-            what ``actions`` and ``robot_obs`` say it is; the message names the file.
+        ValueError: a number is not finite as float32, a distance does not fit into its video, a gripper command is
+            neither -1 nor 1, or a relative action is not what ``actions`` and ``robot_obs`` say it is; the message
+            names the file.
     """
+    limits = limits or {}
 
     def file_of(row: np.integer) -> Path:
         return split.frame_file(frames[int(row)])
@@ -73,9 +82,23 @@ def check_frames(columns: dict[str, np.ndarray], frames: range, split: CalvinSpl
     for key, column in columns.items():
         if column.dtype == np.uint8:
             continue
-        bad = ~np.isfinite(column.reshape(len(column), -1)).all(axis=1)
+        with np.errstate(over="ignore"):  # what is stored is float32: 1e39 would become infinite
+            rows = column.reshape(len(column), -1).astype(np.float32, copy=False)
+        bad = ~np.isfinite(rows).all(axis=1)
         if bad.any():
-            raise ValueError(f"{file_of(bad.argmax())}: array {key!r} holds a number that is not finite")
+            raise ValueError(
+                f"{file_of(bad.argmax())}: array {key!r} holds a number that is not finite in float32"
+            )
+        if key in limits:
+            low, high = limits[key]
+            nearest, farthest = rows.min(axis=1), rows.max(axis=1)
+            bad = (nearest < low) | (farthest > high)
+            if bad.any():
+                row = bad.argmax()
+                raise ValueError(
+                    f"{file_of(row)}: array {key!r}: distances of {nearest[row]:g} to {farthest[row]:g} m do not fit "
+                    f"into a depth video of {low:g} to {high:g} m; --images=png keeps them exactly"
+                )
     gripper = columns["actions"][:, 6]
     neither = ~np.isin(gripper, (-1, 1))
     if neither.any():
@@ -101,7 +124,7 @@ def block_order(scene: str, votes: np.ndarray) -> tuple[str, ...]:
 
     The documentation says red, blue, pink; the simulator writes another order in scenes A and C. So the data
     decide: in a window that lifts the red block, the red column rises. The scene's known order serves where
-    the data do not speak against it.
+    the data leave a choice, or say nothing.
 
     Args:
         scene: the scene's letter.
@@ -112,20 +135,18 @@ def block_order(scene: str, votes: np.ndarray) -> tuple[str, ...]:
         Three colours, the first being that of the first column.
 
     Raises:
-        ValueError: the scene is unknown and the data do not settle it, or the data contradict themselves or
-        the
-            known order without settling another one.
+        ValueError: the scene is unknown and the data do not settle it, or no order explains at least 0.8 of the
+            votes.
     """
     known = SCENE_BLOCK_ORDER.get(scene)
     orders = list(permutations(COLOURS))
     scores = {order: sum(votes[COLOURS.index(c), j] for j, c in enumerate(order)) for order in orders}
     best = max(scores.values())
     winners = [order for order, score in scores.items() if score == best]
-    if known in winners:
-        return known
+    order = known if known in winners else winners[0] if len(winners) == 1 else None
     # A few public annotations name the wrong colour, hence a majority and not unanimity.
-    if len(winners) == 1 and best >= 0.8 * votes.sum():
-        return winners[0]
+    if order is not None and best >= 0.8 * votes.sum():
+        return order
     evidence = "; ".join(f"lift_{c}: columns rose {votes[i].tolist()} times" for i, c in enumerate(COLOURS))
     raise ValueError(
         f"scene {scene}: cannot tell which block is in which column of scene_obs ({evidence}; known order: "
@@ -136,6 +157,9 @@ def block_order(scene: str, votes: np.ndarray) -> tuple[str, ...]:
 def block_votes(split: CalvinSplit, scene: str) -> np.ndarray:
     """Counts which block column rises in each lifting window of a scene.
 
+    A window whose first or last frame is defective does not vote: if it is to be converted, that is reported, or
+    the window left out, then.
+
     Returns:
         (3, 3) int64: row = colour named by the task in the order of :data:`COLOURS`, column = block column.
     """
@@ -144,8 +168,13 @@ def block_votes(split: CalvinSplit, scene: str) -> np.ndarray:
         colour = window.task.removeprefix("lift_").partition("_")[0]
         if window.scene != scene or not window.task.startswith("lift_") or colour not in COLOURS:
             continue
-        ends = split.read([window.start, window.end - 1], ["scene_obs"])["scene_obs"]
-        rise = (ends[1] - ends[0])[_BLOCKS_START + 2 :: _BLOCK_LENGTH]
+        ends = [window.start, window.end - 1]
+        try:
+            columns = split.read(ends, VECTORS)
+            check_frames(columns, ends, split)
+        except (FileNotFoundError, ValueError):
+            continue
+        rise = np.diff(columns["scene_obs"], axis=0)[0, _BLOCKS_START + 2 :: _BLOCK_LENGTH]
         if rise.max() > _LIFTED:
             votes[COLOURS.index(colour), rise.argmax()] += 1
     return votes

@@ -3,7 +3,6 @@
 import json
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 from bisect import bisect_left
@@ -117,6 +116,8 @@ class ConvertConfig:
             raise ValueError(f"--workers={self.workers}: expected 1 or more")
         if self.push_to_hub and self.repo_id.count("/") != 1:
             raise ValueError(f"--repo_id={self.repo_id}: expected user/name to push to the hub")
+        if self.private and not self.push_to_hub:
+            raise ValueError("--private=true is for --push_to_hub=true: nothing is uploaded without it")
         check_executor(self.executor, self.slurm)
 
     def request(self, split: CalvinSplit) -> dict[str, Any]:
@@ -177,13 +178,11 @@ def convert(config: ConvertConfig) -> Path:
     request = config.request(split)
     if _is_done(config.target, request):
         print(f"{config.target} already holds this conversion", file=sys.stderr)
+        publish.tidy(config.target)
         _after(config, split)
         return config.target
-    arrays = [*VECTORS, *(CAMERAS if config.embed else ())]
     job, info, report = plan(config, split)
-    split.read(
-        [job.spans[0].start], dict.fromkeys([*arrays, *job.arrays()])
-    )  # what was not recorded is reported at once
+    _check_recorded(config, job)
     if config.embed:
         from dataset_convert import embed
 
@@ -205,6 +204,25 @@ def convert(config: ConvertConfig) -> Path:
             desc="converting",
         )
     return config.target
+
+
+def _check_recorded(config: ConvertConfig, job: Job) -> None:
+    """Reads the first frame of an episode, so that pictures that were not recorded are reported at once.
+
+    Raises:
+        FileNotFoundError, ValueError: it cannot be read; with ``skip_bad``: that of no episode can.
+    """
+    arrays = dict.fromkeys([*VECTORS, *(CAMERAS if config.embed else ()), *job.arrays()])
+    first: Exception | None = None
+    for span in job.spans:
+        try:
+            job.split.read([span.start], arrays)
+            return
+        except (FileNotFoundError, ValueError) as error:
+            if not config.skip_bad:
+                raise
+            first = first or error
+    raise ValueError(f"{job.split.folder}: no episode is left to convert; the first: {first}") from first
 
 
 def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str, Any]]:
@@ -351,9 +369,7 @@ def _logs(config: ConvertConfig, folder: Path) -> Path:
     """datatrove's. Those of Slurm jobs outlive the staging folder, the others say nothing that matters."""
     if config.executor == "slurm":
         return config.target.parent / f"{config.target.name}.slurm_logs"
-    logs = folder / "jobs"
-    shutil.rmtree(logs, ignore_errors=True)  # the shards' own notes say what is done
-    return logs
+    return folder / "jobs"
 
 
 def _say(text: str) -> None:

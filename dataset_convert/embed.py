@@ -18,7 +18,9 @@ from draccus.utils import DraccusException
 from tqdm import tqdm
 
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.convert import ClipOptions, folder_of
+from dataset_convert.convert import ClipOptions
+from dataset_convert.hub import find_dataset
+from dataset_convert.shards import sha256
 
 if TYPE_CHECKING:
     from lerobot_lansar.policy.clip import Clip
@@ -26,6 +28,10 @@ if TYPE_CHECKING:
 CAMERAS = {"observation.images.static": "rgb_static", "observation.images.gripper": "rgb_gripper"}
 """LeRobot feature -> CALVIN array of the pictures that are embedded."""
 
+PARTIAL = Path(".cache") / "huggingface" / "lansar_clip"
+"""Where a pass works until it is done: the hub's client never uploads what lies in this folder of a dataset."""
+
+_STATE = "state.json"  # how far a pass came
 _SAVE_EVERY = 20  # batches
 
 
@@ -35,7 +41,7 @@ class EmbedConfig:
 
     # name of the dataset, you/name
     repo_id: str
-    # its folder; by default where LeRobot looks for a dataset of that name
+    # its folder; by default where LeRobot looks for a dataset of that name, or its download from the hub
     dataset_dir: Path | None = None
     clip: ClipOptions = field(default_factory=ClipOptions)
     # pictures of each camera at a time
@@ -154,7 +160,8 @@ def embed(
 ) -> None:
     """Writes ``clip/<image feature>.npy``, (total_frames, D) float16 ordered by absolute index, and ``clip/clip.json``.
 
-    The folder appears complete; an interrupted pass goes on where it was last saved.
+    ``clip.json`` says which CLIP it was, of which frames (``fingerprint``), and each array's SHA-256. The folder
+    appears complete; a pass that was interrupted, or killed at any time, goes on where it was last saved.
 
     Args:
         root: the dataset's folder.
@@ -182,9 +189,10 @@ def embed(
         "pictures": pictures.name,
     }
     folder = clip_dir(root)
-    partial = folder.with_name("clip.partial")
+    partial = root / PARTIAL
     if folder.exists():
         _check_same(folder, description)
+        (folder / _STATE).unlink(missing_ok=True)  # a pass was killed after its last step but one
         print(f"{folder} already holds these embeddings", file=sys.stderr)
         return
     done = _begin(partial, description, total)
@@ -207,9 +215,11 @@ def embed(
                 _save(partial, arrays, description, done)
     _save(partial, arrays, description, done)
     del arrays
-    (partial / "state.json").unlink()
-    (partial / "clip.json").write_text(json.dumps(description, indent=2) + "\n")
+    hashes = {f"{key}.npy": sha256(partial / f"{key}.npy") for key in CAMERAS}
+    (partial / "clip.json").write_text(json.dumps({**description, "files": hashes}, indent=2) + "\n")
     partial.rename(folder)
+    # Last: without its state an unfinished pass would be begun again.
+    (folder / _STATE).unlink()
 
 
 def _check_same(folder: Path, wanted: dict[str, Any]) -> None:
@@ -226,13 +236,13 @@ def _check_same(folder: Path, wanted: dict[str, Any]) -> None:
 
 def _begin(partial: Path, description: dict[str, Any], total: int) -> int:
     """How many pictures an earlier pass has done; new arrays if it was another one."""
-    state = partial / "state.json"
+    state = partial / _STATE
     if state.is_file():
         saved = json.loads(state.read_text())
         if saved["description"] == description:
             return saved["done"]
     shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
+    partial.mkdir(parents=True)
     for key in CAMERAS:
         shape = (total, description["embed_dim"])
         np.lib.format.open_memmap(partial / f"{key}.npy", "w+", np.float16, shape)
@@ -244,7 +254,7 @@ def _save(partial: Path, arrays: dict[str, Any], description: dict[str, Any], do
         array.flush()
     temporary = partial / "state.tmp"
     temporary.write_text(json.dumps({"description": description, "done": done}))
-    temporary.rename(partial / "state.json")
+    temporary.rename(partial / _STATE)
 
 
 def main() -> int:
@@ -253,7 +263,7 @@ def main() -> int:
         config = draccus.parse(EmbedConfig)
         if config.batch_size < 1 or config.num_workers < 0:
             raise ValueError("--batch_size must be 1 or more, --num_workers 0 or more")
-        root = folder_of(config.repo_id, config.dataset_dir)
+        root = find_dataset(config.repo_id, config.dataset_dir)
         if not (root / "meta" / "info.json").is_file():
             raise FileNotFoundError(f"{root} holds no LeRobotDataset: give its folder as --dataset_dir")
         clip = load_clip(config.clip.model, config.clip.pretrained)

@@ -1,6 +1,7 @@
 """The conversion's last step: all shards become one dataset."""
 
 import json
+import os
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,12 @@ def finish(
         frames,
         features.merge_stats(stats),
     )
+    # The manifest is what is left in meta: it is written last and cannot hold its own hash.
+    for path in sorted((job.dataset / "meta").rglob("*")):
+        if path.is_file() and path != job.dataset / MANIFEST:
+            files[path.relative_to(job.dataset).as_posix()] = sha256(path)
+    here = f"{job.split.root}{os.sep}"  # no path of this machine is published
+    left_out = [{**episode, "reason": episode["reason"].replace(here, "")} for episode in left_out]
     orders = job.block_orders.items()
     manifest = {
         "request": request,

@@ -27,8 +27,8 @@ def staging_of(output_dir: Path) -> Path:
 def staging(output_dir: Path, request: dict[str, Any]) -> Iterator[Path]:
     """Gives the staging folder of ``output_dir``, new or with what an interrupted run of the same request left.
 
-    A lock that dies with its process keeps two runs from sharing it. If the block raises before any shard is finished,
-    the folder is removed.
+    A lock that dies with its process keeps two runs from sharing it. If the block raises, nothing counts as submitted;
+    if that is before any shard is finished, the folder is removed.
 
     Args:
         output_dir: the folder to create.
@@ -46,6 +46,7 @@ def staging(output_dir: Path, request: dict[str, Any]) -> Iterator[Path]:
         try:
             yield folder
         except BaseException:
+            (folder / _SUBMITTED).unlink(missing_ok=True)
             if not finished_shards(folder):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -66,11 +67,18 @@ def mark_submitted(folder: Path) -> None:
 def publish(folder: Path, output_dir: Path) -> None:
     """Renames the finished dataset to its place and removes the rest."""
     (folder / DATASET).rename(output_dir)
-    shutil.rmtree(folder, ignore_errors=True)
+    tidy(output_dir)
+
+
+def tidy(output_dir: Path) -> None:
+    """Removes what making a dataset left beside it, once it is in its place."""
+    shutil.rmtree(staging_of(output_dir), ignore_errors=True)
 
 
 def _claim(folder: Path, output_dir: Path, request: dict[str, Any]) -> None:
     file = folder / "request.json"
+    if not (folder / DATASET).exists():  # new, or left by a run that was killed just after it published
+        _empty(folder)
     if (folder / _SUBMITTED).exists():
         raise ValueError(
             f"Slurm jobs for {output_dir} were submitted already: wait for them, or cancel them and delete "
@@ -82,13 +90,17 @@ def _claim(folder: Path, output_dir: Path, request: dict[str, Any]) -> None:
                 f"{folder} holds a conversion that was begun with other options: repeat those of {file}, or delete "
                 "that folder"
             )
-        for stale in folder.iterdir():
-            shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
+        _empty(folder)
         partial = file.with_suffix(".partial")
         partial.write_text(json.dumps(request, indent=1) + "\n")
         partial.rename(file)
     for name in (DATASET, SHARDS):
         (folder / name).mkdir(exist_ok=True)
+
+
+def _empty(folder: Path) -> None:
+    for stale in folder.iterdir():
+        shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
 
 
 def _lock(lock: int, folder: Path, output_dir: Path) -> None:

@@ -62,6 +62,15 @@ class Job:
         """CALVIN's picture arrays that are needed."""
         return list(dict.fromkeys(picture.array for picture in self.layout.pictures))
 
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """For CALVIN's arrays that become depth videos the distances (m) that these can hold."""
+        codecs = {picture.array: picture.codec for picture in self.layout.pictures}
+        return {
+            array: (codec.depth["depth_min"], codec.depth["depth_max"])
+            for array, codec in codecs.items()
+            if codec and codec.depth
+        }
+
 
 class BadEpisode(Exception):
     """An episode of the source is defective.
@@ -120,7 +129,9 @@ def convert_shard(job: Job, shard: int) -> None:
     while True:
         progress = _Progress(note.with_suffix(".count"))
         hashes: list[str] = []
-        episodes = (_hashed(job, n, progress, hashes) for n in range(first, end) if n not in bad)
+        episodes = (
+            (len(job.spans[n]), _hashed(job, n, progress, hashes)) for n in range(first, end) if n not in bad
+        )
         try:
             written = write_shard(job.dataset, job.layout, place, episodes, job.tasks)
             break
@@ -168,8 +179,8 @@ def _blocks(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[Block,
         frames = range(start, min(start + BLOCK, span.end))
         try:
             arrays = job.split.read(frames, keys)
-            checks.check_frames(arrays, frames, job.split)
-        except (OSError, ValueError) as error:
+            checks.check_frames(arrays, frames, job.split, job.limits())
+        except (FileNotFoundError, ValueError) as error:
             raise BadEpisode(number, error) from error
         here = windows[start - span.start :][: len(frames)]
         yield to_block(job, span, frames, here, arrays), arrays

@@ -5,7 +5,7 @@ import json
 import multiprocessing
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,21 @@ from PIL import Image
 from tqdm import tqdm
 
 from dataset_convert import checks
-from dataset_convert.calvin import CAMERAS, DEPTH, FPS, TACTILE, VECTORS, CalvinSplit
-from dataset_convert.convert import folder_of
-from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
+from dataset_convert.calvin import CAMERAS, DEPTH, FPS, SCENES, TACTILE, TASKS, VECTORS, CalvinSplit
+from dataset_convert.episodes import (
+    NO_COMMAND,
+    Span,
+    as_ranges,
+    play_spans,
+    shared_frames,
+    window_of_frames,
+    window_spans,
+)
+from dataset_convert.hub import find_dataset
 from dataset_convert.shards import sha256
 from dataset_convert.writer import digest
 
+_MANIFEST = "meta/calvin_source.json"  # dataset_convert.finish, which has it too, imports LeRobot
 _BETTER = 0.9  # of the squared error; a video of the desk that is a frame off has more than twice that of a right one
 
 
@@ -36,7 +45,7 @@ class VerifyConfig:
     repo_id: str
     # folder of the CALVIN dataset, the one that holds training/ and validation/
     root: Path
-    # the dataset's folder; by default where LeRobot looks for a dataset of that name
+    # the dataset's folder; by default where LeRobot looks for a dataset of that name, or its download from the hub
     dataset_dir: Path | None = None
     # smallest peak signal-to-noise ratio (dB) of a picture in a video; PNG must be equal
     min_psnr: float = 22.0
@@ -66,29 +75,37 @@ class Found:
 class Dataset:
     """What a converted dataset says of itself, beside its source.
 
+    Attributes:
+        folder, info, manifest, tasks, sentence: the dataset's.
+        split: the source.
+        spans: its episodes in the source, as the manifest lists them.
+        windows: per episode the window of each frame.
+        orders: scene -> colours of its block columns, established from the source again.
+
     Raises:
         FileNotFoundError: it is no dataset of ``lansar-convert``.
-        Mismatch: it was made from another source.
+        Mismatch: it was made from another source, or its files were changed since.
     """
 
     def __init__(self, folder: Path, root: Path):
+        if not (folder / _MANIFEST).is_file():
+            raise FileNotFoundError(
+                f"{folder / _MANIFEST} is missing: --dataset_dir must hold a result of lansar-convert"
+            )
         self.folder = folder
-        for name in ("meta/info.json", "meta/calvin_source.json"):
-            if not (folder / name).is_file():
-                raise FileNotFoundError(
-                    f"{folder / name} is missing: --dataset_dir must hold a result of lansar-convert"
-                )
-        self.info = json.loads((folder / "meta/info.json").read_text())
-        self.manifest = json.loads((folder / "meta/calvin_source.json").read_text())
+        self.manifest = json.loads((folder / _MANIFEST).read_text())
         self.split = CalvinSplit(root, self.manifest["request"]["split"])
         if self.split.source_sha256 != self.manifest["request"]["source_sha256"]:
             raise Mismatch(f"{self.split.folder}: its index files are not those that {folder} was made from")
+        _check_files(folder, self.manifest["files"])
+        self.info = json.loads((folder / "meta/info.json").read_text())
         self.tasks = pq.read_table(folder / "meta/tasks.parquet").to_pylist()
         self.sentence = {row["task_index"]: row["task"] for row in self.tasks}
-        self.spans = [
-            Span(e["start"], e["end"], e["scene"], tuple(e["windows"])) for e in self.manifest["episodes"]
-        ]
+        self.spans = [_span(episode) for episode in self.manifest["episodes"]]
         self.windows = [window_of_frames(span, self.split.windows) for span in self.spans]
+        self.orders: dict[str, tuple[str, ...]] = {}
+        for scene in sorted({span.scene for span in self.spans}):
+            self.orders[scene] = checks.block_order(scene, checks.block_votes(self.split, scene))
 
     def source_of(self, feature: str) -> tuple[str, Any]:
         """CALVIN's array that a camera feature shows, and the part of its last axis."""
@@ -105,6 +122,10 @@ class Dataset:
         return array, slice(None)
 
 
+def _span(described: dict[str, Any]) -> Span:
+    return Span(described["start"], described["end"], described["scene"], tuple(described["windows"]))
+
+
 def verify(config: VerifyConfig) -> str:
     """Compares a dataset with its source.
 
@@ -116,10 +137,13 @@ def verify(config: VerifyConfig) -> str:
         Mismatch: they differ; the message says where.
         ValueError: the source is defective.
     """
-    folder = folder_of(config.repo_id, config.dataset_dir)
+    folder = find_dataset(config.repo_id, config.dataset_dir)
     dataset = Dataset(folder, config.root)
-    _check_files(dataset)
+    _check_manifest(dataset)
+    _check_spans(dataset)
+    _check_pictures(dataset)
     _check_episodes(dataset)
+    clip = _check_clip(dataset)
     files = sorted((folder / "data").rglob("*.parquet"))
     frames = 0
     psnr: dict[str, list[float]] = {}
@@ -141,7 +165,8 @@ def verify(config: VerifyConfig) -> str:
     _check_stats(dataset, sums, frames)
     lines = [
         f"{folder}: {len(dataset.spans)} episodes, {frames} frames equal {dataset.split.folder}: state, scene and both "
-        "forms of the action exactly, as are commands, tasks, scenes, windows and times"
+        "forms of the action exactly, as are commands, tasks, scenes, windows and times",
+        f"{len(dataset.manifest['left_out'])} defective episodes are listed as left out; no other one is missing",
     ]
     for key, feature in dataset.info["features"].items():
         if key in psnr:
@@ -150,7 +175,7 @@ def verify(config: VerifyConfig) -> str:
             )
         elif feature["dtype"] == "image":
             lines.append(f"{key}: equal, pixel by pixel")
-    return "\n".join(lines)
+    return "\n".join(lines + clip)
 
 
 def _each(work: Any, files: list[Path], workers: int) -> Iterator[Found]:
@@ -161,50 +186,177 @@ def _each(work: Any, files: list[Path], workers: int) -> Iterator[Found]:
         yield from pool.imap_unordered(work, files)
 
 
-def _check_files(dataset: Dataset) -> None:
-    """Every file of frames is there, none other, and is what was published."""
-    listed = dataset.manifest["files"]
+def _check_manifest(dataset: Dataset) -> None:
+    """What the manifest says of the source is so: windows, names, block columns, frames of both splits."""
+    manifest, split = dataset.manifest, dataset.split
+    scenes = {
+        scene: {"frames": list(split.scenes[scene]), "block_order": list(order)}
+        for scene, order in dataset.orders.items()
+    }
+    for name, told, found in (
+        ("windows", manifest["windows"], [asdict(window) for window in split.windows]),
+        ("task_names", manifest["task_names"][: len(TASKS)], list(TASKS)),
+        ("scene_names", manifest["scene_names"][: len(SCENES)], list(SCENES)),
+        ("scenes", manifest["scenes"], scenes),
+    ):
+        if told != found:
+            what = f"{told}, {found}" if name == "scenes" else "something else"
+            raise Mismatch(f"{dataset.folder}/{_MANIFEST}: {name} are not what {split.folder} says: {what}")
+    if manifest["request"]["split"] == "training":
+        shared = shared_frames(split)
+        if shared and shared != manifest["shared_frames"]:  # none: the source has no validation/ here
+            raise Mismatch(
+                f"{dataset.folder}/{_MANIFEST}: training and validation share frames {as_ranges(shared)}, it says "
+                f"{as_ranges(manifest['shared_frames']) or 'none'}"
+            )
+
+
+def _check_spans(dataset: Dataset) -> None:
+    """Every episode that was asked for is here or on the list of what was left out, and no other is."""
+    manifest, split = dataset.manifest, dataset.split
+    request = manifest["request"]
+    excluded = manifest["shared_frames"] if request["exclude_shared"] else []
+    if request["mode"] == "play":
+        wanted = play_spans(split, excluded)
+    else:
+        wanted = window_spans(split.windows, request["dedup"], excluded)
+    left_out = [_span(e) for e in manifest["left_out"]]
+    place = f"{dataset.folder}/{_MANIFEST}"
+    if left_out and not request["skip_bad"]:
+        raise Mismatch(f"{place}: {len(left_out)} episodes were left out without --skip_bad=true")
+    listed, known = {*dataset.spans, *left_out}, set(wanted)
+    for what, spans in (
+        ("missing and not listed as left out", [span for span in wanted if span not in listed]),
+        ("not asked for", [span for span in (*dataset.spans, *left_out) if span not in known]),
+    ):
+        if spans:
+            first = f"frames {spans[0].start}-{spans[0].end - 1}, windows {list(spans[0].windows)}"
+            raise Mismatch(f"{place}: {len(spans)} episodes are {what}; the first: {first}")
+    if dataset.spans != [span for span in wanted if span not in set(left_out)]:
+        raise Mismatch(f"{place}: episodes are in another order than the source's, or there twice")
+
+
+def _check_files(folder: Path, listed: dict[str, str]) -> None:
+    """Every file of data, videos and meta is there, none other, and is what was published."""
     there = {
-        path.relative_to(dataset.folder).as_posix()
-        for part in ("data", "videos")
-        for path in (dataset.folder / part).rglob("*")
+        path.relative_to(folder).as_posix()
+        for part in ("data", "videos", "meta")
+        for path in (folder / part).rglob("*")
         if path.is_file()
     }
+    _check_hashes(folder, there - {_MANIFEST}, listed, "was converted")
+
+
+def _check_hashes(folder: Path, there: set[str], listed: dict[str, str], since: str) -> None:
+    """Compares file names and hashes with a list of them."""
     if there != listed.keys():
-        raise Mismatch(
-            f"{dataset.folder}: missing or surplus files: {', '.join(sorted(there ^ listed.keys())[:5])}"
-        )
+        names = ", ".join(sorted(there ^ listed.keys())[:5])
+        raise Mismatch(f"{folder}: missing or surplus files: {names}")
     for name, sha in tqdm(listed.items(), desc="hashing", unit="file", leave=False):
-        if sha256(dataset.folder / name) != sha:
-            raise Mismatch(f"{dataset.folder / name} was changed since it was converted (SHA-256)")
+        if sha256(folder / name) != sha:
+            raise Mismatch(f"{folder / name} was changed since it {since} (SHA-256)")
+
+
+def _check_clip(dataset: Dataset) -> list[str]:
+    """Embeddings, if there are any, belong to these frames and are what was written; a line that says so."""
+    folder = dataset.folder / "clip"
+    if not folder.exists():
+        return []
+    from lerobot_lansar.policy.frames import dataset_fingerprint
+
+    if not (folder / "clip.json").is_file():
+        raise Mismatch(f"{folder} holds no clip.json: delete that folder and run lansar-embed")
+    told = json.loads((folder / "clip.json").read_text())
+    there = {path.name for path in folder.iterdir()} - {"clip.json", "state.json"}
+    _check_hashes(folder, there, told.get("files", {}), "was embedded")
+    if told["fingerprint"] != dataset_fingerprint(dataset.folder):
+        raise Mismatch(f"{folder} holds embeddings of other frames: delete that folder and run lansar-embed")
+    return [
+        f"{folder.name}: as {told['model']} {told['pretrained'] or 'untrained'} left it, for these frames"
+    ]
+
+
+def _check_pictures(dataset: Dataset) -> None:
+    """meta/info.json says how the pictures lie: a label the wrong way round transposes them."""
+    for key, feature in dataset.info["features"].items():
+        if feature["dtype"] not in ("video", "image"):
+            continue
+        height, width = (CAMERAS | DEPTH | TACTILE)[dataset.source_of(key)[0]][:2]
+        wanted = [height, width, 1 if key.endswith("_depth") else 3], ["height", "width", "channels"]
+        if (feature["shape"], feature["names"]) != wanted:
+            told = f"{feature['shape']} {feature['names']}"
+            raise Mismatch(
+                f"{dataset.folder}/meta/info.json: {key} is {told}, expected {wanted[0]} {wanted[1]}"
+            )
 
 
 def _check_episodes(dataset: Dataset) -> None:
-    """meta/episodes and the counters of meta/info.json agree with the manifest."""
-    rows: list[dict[str, Any]] = []
-    columns = ["episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"]
-    for path in sorted((dataset.folder / "meta/episodes").rglob("*.parquet")):
-        rows += pq.read_table(path, columns=columns).to_pylist()
-    index = 0
+    """meta/episodes says where each episode lies, and the counters of meta/info.json agree."""
+    info = dataset.info
+    videos = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    files = _files_of_episodes(dataset.folder)
+    rows = list(_episode_rows(dataset.folder))
+    if sorted(files) != list(range(len(dataset.spans))):
+        raise Mismatch(f"{dataset.folder}/data holds other episodes than 0-{len(dataset.spans) - 1}")
+    index, file, first = 0, None, 0
     for number, (row, span) in enumerate(zip(rows, dataset.spans, strict=False)):
-        windows = dict.fromkeys(dataset.windows[number].tolist())
+        if files[number] != file:
+            file, first = files[number], index  # a file, and the videos of the same number, begin here
+        place = dict(zip(("chunk_index", "file_index"), files[number], strict=True))
         wanted = {
             "episode_index": number,
-            "tasks": list(dict.fromkeys(_sentence(dataset, window) for window in windows)),
+            "tasks": list(dict.fromkeys(_sentence(dataset, w) for w in dataset.windows[number].tolist())),
             "length": len(span),
             "dataset_from_index": index,
             "dataset_to_index": index + len(span),
+            **{f"data/{name}": value for name, value in place.items()},
         }
+        for key in videos:
+            wanted |= {f"videos/{key}/{name}": value for name, value in place.items()}
+            wanted[f"videos/{key}/from_timestamp"] = (index - first) / FPS
+            wanted[f"videos/{key}/to_timestamp"] = (index - first + len(span)) / FPS
         index += len(span)
-        if row != wanted:
-            raise Mismatch(f"{dataset.folder}/meta/episodes: episode {number} is {row}, expected {wanted}")
-    info = dataset.info
+        for name, value in wanted.items():
+            if row.get(name) != value:
+                raise Mismatch(
+                    f"{dataset.folder}/meta/episodes: episode {number}: {name} is {row.get(name)}, expected {value}"
+                )
     counted = len(rows), index, len(dataset.tasks), FPS
     told = info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]
     if counted != told or len(rows) != len(dataset.spans):
         raise Mismatch(
             f"{dataset.folder}/meta/info.json says {told} episodes, frames, tasks, fps; counted {counted}"
         )
+
+
+def _files_of_episodes(folder: Path) -> dict[int, tuple[int, int]]:
+    """Episode -> chunk and file number of the frame table that holds it.
+
+    Raises:
+        Mismatch: an episode lies in two files.
+    """
+    found: dict[int, tuple[int, int]] = {}
+    for path in sorted((folder / "data").rglob("*.parquet")):
+        for episode in pq.read_table(path, columns=["episode_index"])["episode_index"].unique().to_pylist():
+            if episode in found:
+                raise Mismatch(f"{path}: episode {episode} is in another file too")
+            found[episode] = _chunk_and_file(path)
+    return found
+
+
+def _episode_rows(folder: Path) -> Iterator[dict[str, Any]]:
+    """The rows of meta/episodes in order, without statistics.
+
+    Raises:
+        Mismatch: a row says that it is in another file than it is.
+    """
+    for path in sorted((folder / "meta/episodes").rglob("*.parquet")):
+        names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
+        for row in pq.read_table(path, columns=names).to_pylist():
+            told = row.get("meta/episodes/chunk_index"), row.get("meta/episodes/file_index")
+            if told != _chunk_and_file(path):
+                raise Mismatch(f"{path}: meta/episodes/chunk_index, meta/episodes/file_index are {told}")
+            yield row
 
 
 def _sentence(dataset: Dataset, window: int) -> str:
@@ -289,7 +441,7 @@ def _wanted(
     forms = (
         ("rel_actions", "actions") if manifest["request"]["action"] == "rel" else ("actions", "rel_actions")
     )
-    order = manifest["scenes"][span.scene]["block_order"]
+    order = dataset.orders[span.scene]
     blocks = [6 + 6 * order.index(colour) + i for colour in checks.COLOURS for i in range(6)]
     number = {sentence: index for index, sentence in dataset.sentence.items()}
     return {
@@ -329,10 +481,15 @@ def _add(sums: dict[str, list[np.ndarray]], key: str, values: np.ndarray) -> Non
 
 def _video_of(dataset: Dataset, key: str, data: Path) -> Path:
     """The video that belongs to a file of frames: the same chunk and file number."""
-    chunk, file = (int(part.rpartition("-")[2]) for part in (data.parent.name, data.stem))
+    chunk, file = _chunk_and_file(data)
     return dataset.folder / dataset.info["video_path"].format(
         video_key=key, chunk_index=chunk, file_index=file
     )
+
+
+def _chunk_and_file(path: Path) -> tuple[int, int]:
+    """The numbers in ``chunk-000/file-000.…``."""
+    return int(path.parent.name.rpartition("-")[2]), int(path.stem.rpartition("-")[2])
 
 
 def _decoded(path: Path, feature: dict[str, Any]) -> Iterator[np.ndarray]:
@@ -368,6 +525,8 @@ def _compare(stored: np.ndarray, wanted: np.ndarray, feature: dict[str, Any], pl
         difference = a.astype(np.float32) - b.astype(np.float32)
         return (difference**2).reshape(len(a), -1).mean(axis=1)
 
+    if stored.shape != wanted.shape:
+        raise Mismatch(f"{place}: pictures are {stored.shape[1:]}, the source's {wanted.shape[1:]}")
     error = errors(stored, wanted)
     visible = (peak / 255) ** 2  # below it a codec's rounding decides what fits best
     here = error.mean()

@@ -11,7 +11,7 @@ statistics and in muxing the growing mp4 again (measured with LeRobot 0.6.1). Th
 
 import hashlib
 import io
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -180,7 +180,11 @@ class Written:
 
 
 def write_shard(
-    root: Path, layout: Layout, place: Place, episodes: Iterable[Iterator[Block]], tasks: list[str]
+    root: Path,
+    layout: Layout,
+    place: Place,
+    episodes: Iterable[tuple[int, Iterator[Block]]],
+    tasks: list[str],
 ) -> Written:
     """Writes one shard's frame table and videos.
 
@@ -188,15 +192,14 @@ def write_shard(
         root: the dataset's folder.
         layout: how its files look.
         place: the shard's numbers.
-        episodes: yields the shard's episodes one at a time, each in blocks: one block is in memory.
+        episodes: yields the shard's episodes one at a time, each as its number of frames and its blocks: one block
+            is in memory.
         tasks: sentences in the order of their numbers.
-
-    Raises:
-        ValueError: a distance does not fit into a depth video.
     """
     data_path = root / layout.data_file(place.shard)
     data_path.parent.mkdir(parents=True, exist_ok=True)
     written = Written()
+    has_depth = any(picture.is_depth for picture in layout.pictures)
     index = place.first_index
     with ExitStack() as stack:
         videos = {
@@ -207,8 +210,9 @@ def write_shard(
             if picture.codec
         }
         data = stack.enter_context(pq.ParquetWriter(data_path, layout.schema))
-        for number, blocks in enumerate(episodes, start=place.first_episode):
+        for number, (length, blocks) in enumerate(episodes, start=place.first_episode):
             stats = EpisodeStats()
+            sampled = _sampled(length) if has_depth else np.ones(length, dtype=bool)
             n = 0
             for block in blocks:
                 size = len(block.tasks)
@@ -223,7 +227,9 @@ def write_shard(
                 stats.add(columns)
                 for picture in layout.pictures:
                     pictures = picture.of(block.arrays)
-                    stats.add_pictures(picture, pictures)
+                    stats.add_pictures(
+                        picture, pictures[sampled[n : n + size]] if picture.is_depth else pictures
+                    )
                     if picture.key in videos:
                         videos[picture.key].add(pictures)
                     else:
@@ -257,14 +263,15 @@ class EpisodeStats:
     LeRobot fills a histogram of 5000 bins per dimension to read quantiles from, 25 ms per episode and 8 ms per frame
     with pictures. Sorting, and counting colours, give the same quantiles exactly instead of to within a bin (the
     smallest value that at least a share q of the samples do not exceed) in a thirtieth of the time. LeRobot looks at
-    every picture of an episode of up to 100 frames and at fewer of a longer one; here all are counted. Depth goes
-    through LeRobot's own function.
+    every picture of an episode of up to 100 frames and at fewer of a longer one; here all colours are counted. Depth
+    goes through LeRobot's own histograms, which take the pictures that LeRobot looks at block by block.
     """
 
     def __init__(self) -> None:
         self._columns: dict[str, list[np.ndarray]] = defaultdict(list)
         self._colours: dict[str, np.ndarray] = {}
-        self._depths: dict[str, list[np.ndarray]] = defaultdict(list)
+        self._depths: dict[str, Any] = {}
+        self._depth_pictures: Counter[str] = Counter()
         self._frames = 0
 
     def add(self, columns: dict[str, np.ndarray]) -> None:
@@ -274,9 +281,14 @@ class EpisodeStats:
         self._frames += len(next(iter(columns.values())))
 
     def add_pictures(self, picture: Picture, pictures: np.ndarray) -> None:
-        """Takes a block's pictures of one camera."""
-        if picture.is_depth:  # every tenth picture of a block says enough of slowly changing distances
-            self._depths[picture.key].append(pictures[:: 10 if len(pictures) > 100 else 1])
+        """Takes a block's pictures of one camera: all colours, (n, H, W, 3), or some distances, (n, H, W)."""
+        if picture.is_depth:
+            from lerobot.datasets.compute_stats import RunningQuantileStats
+
+            if len(pictures):
+                running = self._depths.setdefault(picture.key, RunningQuantileStats())
+                running.update(pictures.reshape(-1, 1))
+                self._depth_pictures[picture.key] += len(pictures)
             return
         flat = np.ascontiguousarray(pictures).reshape(-1, pictures.shape[2], 3)
         counts = np.array(Image.fromarray(flat).histogram(), dtype=np.int64).reshape(3, 256)
@@ -305,9 +317,19 @@ class EpisodeStats:
                 stats[key][_name(q)] = values[max(int(np.ceil(q * len(values))) - 1, 0)]
         for key, counts in self._colours.items():
             stats[key] = _colour_stats(counts, self._frames)
-        for key, parts in self._depths.items():
-            stats[key] = _depth_stats(np.concatenate(parts))
+        for key, running in self._depths.items():
+            found = {name: value.reshape(1, 1, 1) for name, value in running.get_statistics().items()}
+            stats[key] = {**found, "count": np.array([self._depth_pictures[key]])}
         return stats
+
+
+def _sampled(length: int) -> np.ndarray:
+    """Which pictures of an episode LeRobot's statistics look at: of 54,000 every fifteenth; (length,) bool."""
+    from lerobot.datasets.compute_stats import sample_indices
+
+    chosen = np.zeros(length, dtype=bool)
+    chosen[sample_indices(length)] = True
+    return chosen
 
 
 def _name(q: float) -> str:
@@ -335,19 +357,12 @@ def _colour_stats(counts: np.ndarray, frames: int) -> dict[str, np.ndarray]:
     return {**shaped, "count": np.array([frames])}
 
 
-def _depth_stats(pictures: np.ndarray) -> dict[str, np.ndarray]:
-    from lerobot.datasets.compute_stats import get_feature_stats
-
-    stats = get_feature_stats(pictures[:, None], axis=(0, 2, 3), keepdims=True)
-    return {k: v if k == "count" else np.squeeze(v, axis=0) for k, v in stats.items()}
-
-
 class Video:
     """An mp4 file that takes pictures one by one."""
 
     def __init__(self, path: Path, picture: Picture):
         assert picture.codec is not None
-        self._picture, self._codec = picture, picture.codec
+        self._codec = picture.codec
         path.parent.mkdir(parents=True, exist_ok=True)
         av.logging.set_level(av.logging.ERROR)  # x264 tells a dozen lines per file
         self.container: Any = av.open(str(path), "w")
@@ -364,17 +379,11 @@ class Video:
         return self
 
     def add(self, pictures: np.ndarray) -> None:
-        """Appends pictures, (n, H, W, 3) uint8 or (n, H, W) float32 (m)."""
+        """Appends pictures, (n, H, W, 3) uint8 or (n, H, W) float32 (m) that fit into the codec's range."""
         depth = self._codec.depth
         if depth is not None:
             from lerobot.datasets.depth_utils import quantize_depth
 
-            low, high = depth["depth_min"], depth["depth_max"]
-            if pictures.min() < low or pictures.max() > high:
-                raise ValueError(
-                    f"{self._picture.array}: distances of {pictures.min():g} to {pictures.max():g} m do not fit into "
-                    f"a depth video of {low:g} to {high:g} m; --images=png keeps them exactly"
-                )
         for picture in pictures:
             if depth is None:
                 frame = av.VideoFrame.from_ndarray(picture, format="rgb24")

@@ -1,7 +1,7 @@
 """Runs work that is cut into shards, then one finishing step: in local processes, under Slurm or on Ray (datatrove).
 
-A shard's number decides what it does, so the result is the same wherever and however often it runs. Finished shards
-are remembered in the logging folder and not repeated.
+A shard's number decides what it does, so the result is the same wherever and however often it runs. Work that is done
+must notice that itself: datatrove's own memory of it, in the logging folder, would outlive what was made.
 """
 
 import contextlib
@@ -9,6 +9,7 @@ import importlib.util
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -94,13 +95,14 @@ def run_shards(
     """Calls ``work`` for every shard and ``finish`` once after them.
 
     Args:
-        work: A function and its first arguments; the shard's number comes last.
+        work: A function and its first arguments; the shard's number comes last. It is called for every shard, also
+            for those that an earlier call finished.
         shards: How many there are.
         finish: A function and its first arguments; it too is called with a number, 0.
         executor: One of :data:`EXECUTORS`.
         workers: Processes at a time; with Slurm the array's limit of tasks at a time.
         slurm: Used by the executor of that name.
-        logging_dir: Where finished shards are remembered and logs are kept.
+        logging_dir: Where logs are kept.
         progress: How many of ``total`` units are done, for the bar of the local executor.
         total, unit, desc: Of the bar.
 
@@ -109,15 +111,20 @@ def run_shards(
 
     Raises:
         WorkerDied: A local worker was killed; the same call goes on where it stopped.
+        subprocess.CalledProcessError: Slurm refused a job; those it had taken are cancelled.
         Exception: Whatever ``work`` or ``finish`` raised.
     """
     quiet = executor == "local"
     steps = [Step(*work, quiet), Step(*finish, quiet)]
     folders = [str(logging_dir / name) for name in ("work", "finish")]
+    for folder in folders:
+        shutil.rmtree(Path(folder) / "completions", ignore_errors=True)
     if executor == "slurm":
+        jobs = _Jobs()
+        options = {**_slurm_options(slurm), "job_id_retriever": jobs}
         first = SlurmPipelineExecutor(
             [steps[0]], shards, workers=workers, tasks_per_job=slurm.shards_per_job, logging_dir=folders[0],
-            job_name="lansar", **_slurm_options(slurm),
+            job_name="lansar", **options,
         )  # fmt: skip
         last = SlurmPipelineExecutor(
             [steps[1]],
@@ -125,9 +132,14 @@ def run_shards(
             logging_dir=folders[1],
             job_name="lansar-finish",
             depends=first,
-            **_slurm_options(slurm),
+            **options,
         )
-        last.run()
+        try:
+            last.run()
+        except BaseException:
+            if jobs:  # or those of the next try would write the same files
+                subprocess.run(["scancel", *jobs], check=False)
+            raise
         return False
     if executor == "ray":
         import ray
@@ -148,6 +160,14 @@ def run_shards(
             local.run()
     finish[0](*finish[1], 0)
     return True
+
+
+class _Jobs(list[str]):
+    """The numbers of submitted jobs: datatrove calls it with what sbatch printed."""
+
+    def __call__(self, printed: str) -> str:
+        self.append(printed.split()[-1])
+        return self[-1]
 
 
 def _slurm_options(slurm: SlurmConfig) -> dict[str, Any]:

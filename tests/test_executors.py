@@ -1,6 +1,7 @@
 """Work under Slurm and on Ray gives the same files as in local processes."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -110,6 +111,44 @@ def test_slurm_jobs_record_the_same(local, slurm, tmp_path):
     assert "already holds a recording (training, validation)" in done.stderr
 
 
+def leave_note(folder, shard):
+    (folder / f"{shard}").touch()
+
+
+def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_failed(
+    slurm, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("PATH", slurm)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # the jobs import leave_note
+    done, finished = tmp_path / "done", tmp_path / "finished"
+    finished.mkdir()
+
+    def submit():
+        done.mkdir()
+        return executors.run_shards(
+            (leave_note, (done,)), 3, (leave_note, (finished,)), executor="slurm", workers=2,
+            slurm=executors.SlurmConfig(partition="cpu", shards_per_job=2), logging_dir=tmp_path / "logs",
+            progress=lambda: 0, total=3, unit="note",
+        )  # fmt: skip
+
+    refuse = 'if "--job-name=lansar-finish" in script:\n    sys.exit("too many jobs")\narray ='
+    (tmp_path / "sbatch").write_text(SBATCH.replace("array =", refuse, 1))
+    (tmp_path / "scancel").write_text(f"#!/bin/sh\necho $@ > {tmp_path}/cancelled\n")
+    (tmp_path / "scancel").chmod(0o755)
+    with pytest.raises(subprocess.CalledProcessError):
+        submit()
+    assert set((tmp_path / "cancelled").read_text().split()) == {"42"}, (
+        "jobs without a finish run for nothing"
+    )
+    assert not list(finished.iterdir())
+    (tmp_path / "sbatch").write_text(SBATCH)
+    for _ in range(2):
+        shutil.rmtree(done)
+        assert not submit()
+        assert sorted(note.name for note in done.iterdir()) == ["0", "1", "2"]
+        (finished / "0").unlink()
+
+
 def test_slurm_without_sbatch_is_refused(tmp_path):
     command = [
         sys.executable,
@@ -152,11 +191,13 @@ def test_a_pool_that_hangs_after_a_worker_died_is_interrupted_until_it_ends(monk
 
 
 def test_slurm_jobs_convert_the_same(local, converted, slurm, tmp_path):
-    options = ["--executor=slurm", "--workers=2", "--slurm.partition=cpu"]
-    convert(local, tmp_path / "out", *options, PATH=slurm)
-    script = (tmp_path / "out.slurm_logs" / "work" / "launch_script.slurm").read_text()
-    assert "#SBATCH --partition=cpu" in script
-    assert contents(tmp_path / "out") == contents(converted)
+    options = ["--executor=slurm", "--workers=2", "--slurm.partition=cpu", "--slurm.shards_per_job=8"]
+    for _ in range(2):  # again, though the logs of the first time, which stay, say that all is done
+        convert(local, tmp_path / "out", *options, PATH=slurm)
+        script = (tmp_path / "out.slurm_logs" / "work" / "launch_script.slurm").read_text()
+        assert "#SBATCH --partition=cpu" in script
+        assert contents(tmp_path / "out") == contents(converted)
+        shutil.rmtree(tmp_path / "out")
 
 
 def test_ray_converts_the_same(local, converted, tmp_path):

@@ -5,9 +5,10 @@ from fake_calvin import write_calvin
 
 
 @pytest.fixture(autouse=True)
-def _offline(tmp_path, monkeypatch):
+def _offline(tmp_path_factory, monkeypatch):
+    home = tmp_path_factory.mktemp("hf")  # not in tmp_path, which tests look into
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    monkeypatch.setenv("HF_HOME", str(home))
 
 
 @pytest.fixture

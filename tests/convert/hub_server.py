@@ -10,6 +10,7 @@ import hashlib
 import json
 import re
 import threading
+import time
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -46,6 +47,7 @@ class Hub:
         repositories: "user/name" -> repository.
         uploads: SHA-256 of every large object that was sent, in order.
         fail_after: refuse large objects after so many; None: never.
+        delay: seconds that receiving a large object takes.
     """
 
     def __init__(self) -> None:
@@ -54,6 +56,7 @@ class Hub:
         self.blobs: dict[str, bytes] = {}
         self.uploads: list[str] = []
         self.fail_after: int | None = None
+        self.delay = 0.0
         self.lock = threading.Lock()
         handler = type("Handler", (_Handler,), {"hub": self})
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
@@ -204,6 +207,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(403, "the line was cut")
         if hashlib.sha256(body).hexdigest() != sha:
             raise _Refused(400, "SHA-256 does not match")
+        time.sleep(self.hub.delay)
         self.hub.uploads.append(sha)
         self.hub.large[sha] = body
         self._answer(b"")

@@ -1,20 +1,23 @@
 """From a CALVIN split to a LeRobotDataset, as a user runs it."""
 
+import errno
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fake_calvin import COMMANDS, write_calvin
 
 from dataset_convert import checks, convert, publish
-from dataset_convert.calvin import COLOURS
+from dataset_convert.calvin import COLOURS, CalvinSplit
 from dataset_convert.convert import ClipOptions, ConvertConfig
 
 
@@ -148,13 +151,34 @@ def test_a_killed_run_leaves_nothing_that_loads_and_the_next_one_goes_on(tmp_pat
     assert not out.exists()
     stalled.unlink()
     stalled.write_bytes(content)
-    done = {note: note.stat().st_mtime_ns for note in staging.glob("shards/*.json")}
-    damaged = json.loads(min(done).read_text())["files"]
-    for name in damaged:  # what is on disk is checked before it is believed
+    damaged, *intact = sorted(staging.glob("shards/*.json"))
+    for name in json.loads(damaged.read_text())["files"]:  # what is on disk is checked before it is believed
         (staging / "dataset" / name).write_bytes(b"half of a file")
+    done = [name for note in intact for name in json.loads(note.read_text())["files"]]
+    written = {name: (staging / "dataset" / name).stat().st_mtime_ns for name in done}
+    assert len(written) >= 4
     convert.convert(options(calvin, out))
     assert files_of(out) == files_of(whole)
+    assert {name: (out / name).stat().st_mtime_ns for name in done} == written, "what was done was done again"
     assert sorted(os.listdir(tmp_path)) == ["calvin", "out", "whole"]
+
+
+def test_a_fault_of_the_machine_is_no_defect_of_the_data(calvin, tmp_path, monkeypatch):
+    """Or --skip_bad=true would leave good episodes out of it for good."""
+    read = CalvinSplit.read
+
+    def out_of_files(self, frames, keys):
+        if 105 in frames:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return read(self, frames, keys)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CalvinSplit, "read", out_of_files)
+        with pytest.raises(OSError, match="Too many open files"):
+            convert.convert(options(calvin, tmp_path / "out", skip_bad=True))
+    assert not (tmp_path / "out").exists()
+    convert.convert(options(calvin, tmp_path / "out", skip_bad=True))
+    assert json.loads((tmp_path / "out/meta/calvin_source.json").read_text())["left_out"] == []
 
 
 def workers_of(parent):
@@ -194,6 +218,43 @@ def test_two_runs_cannot_write_the_same_folder(tmp_path, monkeypatch):
         publish.publish(first, tmp_path / "out")
     assert (tmp_path / "out" / "kept").exists()
     assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_run_killed_just_after_it_published_is_in_nobodys_way(calvin, tmp_path, monkeypatch):
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(publish, "shutil", SimpleNamespace(rmtree=killed))
+        with pytest.raises(KeyboardInterrupt):
+            convert.convert(options(calvin, tmp_path / "out"))
+    whole = files_of(tmp_path / "out")
+    leftover = tmp_path / ".out.incomplete"
+    shutil.copytree(leftover, tmp_path / "leftover")
+    convert.convert(options(calvin, tmp_path / "out"))
+    assert sorted(os.listdir(tmp_path)) == ["calvin", "leftover", "out"], "the next run tidies up"
+
+    shutil.rmtree(tmp_path / "out")
+    shutil.copytree(tmp_path / "leftover", leftover)
+    publish.mark_submitted(leftover)  # as it would be had Slurm's last job been killed
+    assert load(convert.convert(options(calvin, tmp_path / "out", action="abs"))).num_frames == 48
+    shutil.rmtree(tmp_path / "out")
+    shutil.copytree(tmp_path / "leftover", leftover)
+    convert.convert(options(calvin, tmp_path / "out"))
+    assert files_of(tmp_path / "out") == whole
+
+
+def test_a_submission_that_fails_does_not_count_as_one(tmp_path):
+    def submit():
+        with publish.staging(tmp_path / "out", {"a": 1}) as folder:
+            (folder / "shards" / "000000.json").touch()  # a shard of an earlier try, which must not be lost
+            publish.mark_submitted(folder)
+            raise RuntimeError
+
+    for _ in range(2):
+        with pytest.raises(RuntimeError):
+            submit()
+    assert (tmp_path / ".out.incomplete" / "shards" / "000000.json").exists()
 
 
 def test_the_same_request_again_changes_nothing_and_another_one_is_refused(calvin, tmp_path):
@@ -246,6 +307,7 @@ def test_the_command_converts_and_says_where(calvin, tmp_path, monkeypatch, caps
         (["--images=none", "--mode=both"], "--mode=both: expected windows or play"),
         (["--images=none", "--mode=play", "--dedup=task"], "--dedup is for --mode=windows"),
         (["--images=none", "--depth=true"], "--images=none"),
+        (["--images=none", "--private=true"], "--private=true is for --push_to_hub=true"),
         (["--images=none", "--executor=cloud"], "--executor is one of"),
         (["--images=none", "--split=training", "--exclude_shared=perhaps"], "exclude_shared"),
     ],

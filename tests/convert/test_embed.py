@@ -3,13 +3,17 @@
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_calvin import write_calvin
+from huggingface_hub.utils import DEFAULT_IGNORE_PATTERNS, filter_repo_objects
 
 from dataset_convert import embed
 from dataset_convert.convert import ClipOptions, ConvertConfig, convert
+from dataset_convert.shards import sha256
+from dataset_convert.verify import Mismatch, VerifyConfig, verify
 
 clip_module = pytest.importorskip("lerobot_lansar.policy.clip")
 
@@ -54,6 +58,8 @@ def test_exact_pictures_give_the_embeddings_of_the_source(made, run, tmp_path):
         assert (mine.shape, mine.dtype) == (sources.shape, np.float16) == ((32, sources.shape[1]), np.float16)
         np.testing.assert_allclose(mine.astype(float), sources.astype(float), atol=2e-3)
     told, other = (json.loads((where / "clip/clip.json").read_text()) for where in (dataset, made / "png"))
+    for where, description in ((dataset, told), (made / "png", other)):
+        assert description.pop("files") == {Path(name).name: sha256(where / name) for name in FILES}
     assert told.pop("pictures") == "dataset"
     assert other.pop("pictures") == "source"
     assert told == other
@@ -86,6 +92,10 @@ def test_an_interrupted_pass_goes_on(made, run, tmp_path, monkeypatch):
     assert code == 130
     assert "goes on where it stopped" in printed.err
     assert not (dataset / "clip").exists()
+    files = [path.relative_to(dataset).as_posix() for path in dataset.rglob("*") if path.is_file()]
+    uploaded = set(filter_repo_objects(files, ignore_patterns=DEFAULT_IGNORE_PATTERNS))
+    assert {name for name in files if "clip" in name}, "what is done of it is kept"
+    assert not {name for name in uploaded if "clip" in name}, "but a push to the hub would leave it alone"
 
     encoded.clear()
     monkeypatch.setattr(
@@ -97,14 +107,49 @@ def test_an_interrupted_pass_goes_on(made, run, tmp_path, monkeypatch):
     for name in FILES:
         mine, sources = np.load(dataset / name).astype(float), np.load(made / "png" / name).astype(float)
         np.testing.assert_allclose(mine, sources, atol=2e-3)
-    assert not (dataset / "clip.partial").exists()
+    assert not (dataset / embed.PARTIAL).exists()
+
+
+class Killed(BaseException):
+    """Nothing catches it."""
+
+
+@pytest.mark.parametrize(
+    ("step", "name"),
+    [("write_text", "clip.json"), ("rename", embed.PARTIAL.name), ("unlink", "state.json")],
+    ids=["before it is described", "before it is published", "before it is tidied"],
+)
+def test_a_kill_in_the_last_steps_loses_nothing(made, run, tmp_path, monkeypatch, step, name):
+    dataset = without_clip(made, "png", tmp_path)
+    right = getattr(Path, step)
+
+    def dies(self, *arguments, **options):
+        if self.name == name:
+            raise Killed
+        return right(self, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, step, dies)
+        with pytest.raises(Killed):
+            run(dataset)
+    monkeypatch.setattr(clip_module.Clip, "encode_images", lambda *_: pytest.fail("embedded again"))
+    code, printed = run(dataset)
+    assert code == 0, printed.err
+    assert not (dataset / embed.PARTIAL).exists()
+    assert {path.name for path in (dataset / "clip").iterdir()} == {
+        "clip.json",
+        *(Path(name).name for name in FILES),
+    }
+    for name in FILES:
+        mine, sources = np.load(dataset / name).astype(float), np.load(made / "png" / name).astype(float)
+        np.testing.assert_allclose(mine, sources, atol=2e-3)
 
 
 def test_what_another_clip_began_is_not_continued(made, run, tmp_path):
     dataset = without_clip(made, "png", tmp_path)
-    (dataset / "clip.partial").mkdir()
+    (dataset / embed.PARTIAL).mkdir(parents=True)
     state = {"description": {"model": "other"}, "done": 30}
-    (dataset / "clip.partial/state.json").write_text(json.dumps(state))
+    (dataset / embed.PARTIAL / "state.json").write_text(json.dumps(state))
     code, printed = run(dataset)
     assert code == 0, printed.err
     assert all(np.load(dataset / name).any(axis=1).all() for name in FILES)
@@ -133,6 +178,49 @@ def test_the_same_again_does_nothing(made, run):
     assert code == 0
     assert "already holds these embeddings" in printed.err
     assert before == {name: (made / "png" / name).stat().st_mtime_ns for name in FILES}
+
+
+def test_verify_looks_at_embeddings_too(made, tmp_path):
+    dataset = shutil.copytree(made / "png", tmp_path / "png")
+    config = VerifyConfig("me/desk", made / "calvin", dataset)
+    (dataset / "clip/state.json").touch()  # of a pass that was killed after its last step but one
+    assert "clip: as lansar-tiny untrained left it, for these frames" in verify(config)
+    other = json.loads((dataset / "clip/clip.json").read_text()) | {"fingerprint": "0"}
+    (dataset / "clip/clip.json").write_text(json.dumps(other))
+    with pytest.raises(Mismatch, match="embeddings of other frames"):
+        verify(config)
+    with open(dataset / FILES[0], "r+b") as file:
+        file.seek(-1, 2)
+        file.write(b"!")
+    with pytest.raises(Mismatch, match=r"static.npy was changed since it was embedded"):
+        verify(config)
+    (dataset / FILES[0]).unlink()
+    with pytest.raises(Mismatch, match=r"missing or surplus files: observation.images.static.npy"):
+        verify(config)
+    (dataset / "clip/clip.json").unlink()
+    with pytest.raises(Mismatch, match=r"holds no clip.json"):
+        verify(config)
+
+
+def test_a_download_from_the_hub_is_embedded_without_touching_the_cache(made, run, tmp_path, monkeypatch):
+    """Its files are links to blobs that other snapshots share."""
+    copy = without_clip(made, "png", tmp_path)
+    home = tmp_path / "home"
+    repository = home / "hub/datasets--me--desk"
+    snapshot = repository / "snapshots/0123"
+    for path in [path for path in copy.rglob("*") if path.is_file()]:
+        link = snapshot / path.relative_to(copy)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(path)
+    (repository / "refs").mkdir()
+    (repository / "refs/v3.0").write_text("0123")
+    before = (copy / "README.md").read_text()
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(home))
+    monkeypatch.setattr(sys, "argv", ["lansar-embed", *ARGUMENTS])
+    assert embed.main() == 0
+    assert (copy / "README.md").read_text() == before
+    assert "lansar-tiny" in (snapshot / "README.md").read_text()
+    assert "clip: as lansar-tiny" in verify(VerifyConfig("me/desk", made / "calvin"))
 
 
 def test_bad_input_is_one_clear_message(made, run, tmp_path):

@@ -2,16 +2,19 @@
 
 import json
 import shutil
+import tracemalloc
+from itertools import groupby
 
 import numpy as np
 import pytest
 from fake_calvin import COMMANDS, write_calvin
 
-from dataset_convert import convert, episodes
+from dataset_convert import checks, convert, episodes
 from dataset_convert.calvin import SCENES, TASKS, CalvinSplit, Window
 from dataset_convert.convert import ConvertConfig
 from dataset_convert.episodes import NO_COMMAND, window_spans
 from dataset_convert.shards import cut_into_shards
+from dataset_convert.writer import EpisodeStats, Picture
 
 
 def options(calvin, output_dir, **changes):
@@ -147,33 +150,44 @@ def test_all_missing_frames_are_listed(calvin, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_long_list_of_missing_frames_says_how_many_ranges_more():
+    assert episodes.as_ranges(list(range(0, 40, 2))).endswith("36, 38")
+    assert episodes.as_ranges(list(range(0, 50, 2))).endswith("36, 38 and 5 more ranges")
+
+
 DEFECTS = {
-    "a missing frame": lambda calvin: calvin.file(113).unlink(),
-    "a truncated frame": lambda calvin: calvin.file(113).write_bytes(calvin.file(113).read_bytes()[:-50]),
-    "a number that is not finite": lambda calvin: calvin.rewrite(113, robot_obs=np.full(15, np.nan)),
-    "a wrong relative action": lambda calvin: calvin.rewrite(113, rel_actions=np.full(7, 0.2)),
-    "a wrong shape": lambda calvin: calvin.rewrite(113, scene_obs=np.zeros(23)),
-    "a picture of a wrong size": lambda calvin: calvin.rewrite(
-        113, rgb_static=np.zeros((200, 199, 3), np.uint8)
+    "a missing frame": lambda calvin, n: calvin.file(n).unlink(),
+    "a truncated frame": lambda calvin, n: calvin.file(n).write_bytes(calvin.file(n).read_bytes()[:-50]),
+    "a number that is not finite": lambda calvin, n: calvin.rewrite(n, robot_obs=np.full(15, np.nan)),
+    "a number too large for float32": lambda calvin, n: calvin.rewrite(n, scene_obs=np.full(24, 1e39)),
+    "a wrong relative action": lambda calvin, n: calvin.rewrite(n, rel_actions=np.full(7, 0.2)),
+    "a wrong shape": lambda calvin, n: calvin.rewrite(n, scene_obs=np.zeros(23)),
+    "a picture of a wrong size": lambda calvin, n: calvin.rewrite(
+        n, rgb_static=np.zeros((200, 199, 3), np.uint8)
     ),
-    "no picture": lambda calvin: calvin.rewrite(113, rgb_gripper=None),
+    "no picture": lambda calvin, n: calvin.rewrite(n, rgb_gripper=None),
 }
 
 
+@pytest.mark.parametrize("frame", [100, 112, 113, 123], ids="frame {}".format)
 @pytest.mark.parametrize("defect", DEFECTS)
 @pytest.mark.parametrize("mode", ["windows", "play"])
-def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monkeypatch, capsys, defect, mode):
+def test_a_defective_episode_stops_the_conversion_or_is_left_out(
+    tmp_path, monkeypatch, capsys, defect, mode, frame
+):
+    """Whichever of its frames it is: others are read before, the first and the last of a lift among them."""
     monkeypatch.setattr("dataset_convert.shards.BLOCK", 5)  # it is found after a part was written
     if mode == "windows":  # good and bad ones in one file; in play a file each
         monkeypatch.setattr(convert, "cut_into_shards", lambda lengths, most: [(0, len(lengths))])
     calvin = write_calvin(tmp_path / "calvin", rgb=True, length=12)
     record_as(calvin, (100, 111), (112, 123), (124, 147))
-    DEFECTS[defect](calvin)
-    with pytest.raises((ValueError, FileNotFoundError), match="episode_0000113"):
+    DEFECTS[defect](calvin, frame)
+    start, end = (100, 112) if frame == 100 else (112, 124)
+    with pytest.raises((ValueError, FileNotFoundError), match=f"episode_0000{frame}"):
         convert.convert(options(calvin, tmp_path / "strict", images="video", mode=mode))
     out = convert.convert(options(calvin, tmp_path / "out", images="video", mode=mode, skip_bad=True))
     dataset = load(out)
-    kept = [frame for frame in range(100, 148) if not 112 <= frame < 124]
+    kept = [number for number in range(100, 148) if not start <= number < end]
     assert column(dataset, "calvin.frame").tolist() == kept
     assert column(dataset, "index").tolist() == list(range(36))
     assert column(dataset, "episode_index").tolist() == [0] * 12 + (
@@ -183,16 +197,38 @@ def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monke
         wanted = calvin.frames[kept[index]]["rgb_static"].transpose(2, 0, 1) / 255
         np.testing.assert_allclose(dataset[index]["observation.images.static"], wanted, atol=0.02)
     (bad,) = manifest_of(out)["left_out"]
-    assert (bad["start"], bad["end"]) == (112, 124)
-    assert "left out: frames 112-123" in capsys.readouterr().err
+    assert (bad["start"], bad["end"]) == (start, end)
+    assert f"left out: frames {start}-{end - 1}" in capsys.readouterr().err
     assert "1 defective episodes" in (out / "README.md").read_text()
 
 
-def test_nothing_left_is_an_error(calvin, tmp_path):
+def test_nothing_left_is_an_error(calvin, tmp_path, monkeypatch):
     for frame in range(100, 148):
         calvin.rewrite(frame, actions=np.full(7, np.nan))
     with pytest.raises(ValueError, match=r"no episode is left to convert; the first: .*episode_0000100"):
         convert.convert(options(calvin, tmp_path / "out", skip_bad=True))
+    monkeypatch.setattr(convert, "run_shards", lambda *_, **__: pytest.fail("seen too late"))
+    with pytest.raises(ValueError, match=r"no episode is left .*'rgb_static' is missing; recorded without"):
+        convert.convert(options(calvin, tmp_path / "out", images="video", skip_bad=True))
+
+
+@pytest.mark.parametrize(
+    ("scene", "votes"),
+    [
+        ("D", [[5, 4, 0], [4, 5, 0], [0, 0, 2]]),
+        ("D", [[5, 5, 0], [5, 5, 0], [0, 0, 0]]),
+        ("B", [[1, 1, 1], [1, 1, 1], [1, 1, 1]]),
+    ],
+    ids=["the known order is ahead", "it ties with another", "everything rises"],
+)
+def test_contradicting_lifts_are_an_error_even_where_the_known_order_is_not_beaten(scene, votes):
+    with pytest.raises(ValueError, match=f"scene {scene}: cannot tell"):
+        checks.block_order(scene, np.array(votes))
+
+
+def test_lifts_of_one_colour_or_none_leave_the_known_order():
+    for votes in ([[0, 0, 0], [0, 0, 0], [0, 0, 3]], np.zeros((3, 3), int)):
+        assert checks.block_order("D", np.array(votes)) == ("red", "blue", "pink")
 
 
 def test_depth_and_touch_on_request(tmp_path):
@@ -226,11 +262,51 @@ def test_depth_and_touch_on_request(tmp_path):
         convert.convert(options(plain, tmp_path / "none", images="png", depth=True))
 
 
-def test_a_distance_that_a_depth_video_cannot_hold_is_an_error(tmp_path):
-    calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tasks=("open_drawer",), length=3)
+def test_a_distance_that_a_depth_video_cannot_hold_makes_an_episode_defective(tmp_path):
+    calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tasks=("open_drawer",) * 2, length=3)
     calvin.rewrite(101, depth_static=np.full((200, 200), 11, np.float32))
-    with pytest.raises(ValueError, match=r"depth_static: distances of .* to 11 m do not fit .*--images=png"):
+    with pytest.raises(
+        ValueError, match=r"episode_0000101.*depth_static.* of 11 to 11 m do not fit .*--images=png"
+    ):
         convert.convert(options(calvin, tmp_path / "out", images="video", depth=True))
+    exact = convert.convert(options(calvin, tmp_path / "exact", images="png", depth=True))
+    assert load(exact)[1]["observation.images.static_depth"].max() == 11_000, "LeRobot gives millimetres"
+    out = convert.convert(options(calvin, tmp_path / "out", images="video", depth=True, skip_bad=True))
+    assert column(load(out), "calvin.frame").tolist() == [103, 104, 105]
+    (bad,) = manifest_of(out)["left_out"]
+    assert "episode_0000101" in bad["reason"]
+
+
+def test_statistics_of_a_long_recording_look_at_as_much_depth_as_lerobots(tmp_path, monkeypatch):
+    from lerobot.datasets.compute_stats import get_feature_stats, sample_indices
+
+    monkeypatch.setattr("dataset_convert.shards.BLOCK", 50)
+    calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tasks=("open_drawer",) * 4, length=33)
+    out = convert.convert(options(calvin, tmp_path / "out", images="png", depth=True, mode="play"))
+    stats = json.loads((out / "meta" / "stats.json").read_text())["observation.images.static_depth"]
+    frames = [list(calvin.frames)[index] for index in sample_indices(132)]
+    assert len(frames) == 100
+    pictures = np.stack([calvin.frames[frame]["depth_static"] for frame in frames])
+    wanted = get_feature_stats(pictures[:, None], axis=(0, 2, 3), keepdims=True)
+    assert stats["count"] == wanted["count"].tolist() == [100]
+    for name in wanted.keys() - {"count"}:
+        np.testing.assert_allclose(stats[name], wanted[name][0], atol=1e-3 * np.ptp(pictures), err_msg=name)
+
+
+def test_depth_statistics_keep_no_pictures():
+    picture = Picture("observation.images.static_depth", "depth_static", 0, (100, 100, 1))
+    stats = EpisodeStats()
+    rng = np.random.default_rng(0)
+    stats.add_pictures(picture, np.linspace(3, 5, 10_000, dtype=np.float32).reshape(1, 100, 100))
+    tracemalloc.start()
+    try:
+        for _ in range(50):
+            stats.add_pictures(picture, rng.uniform(3, 5, (4, 100, 100)).astype(np.float32))
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 1e6, "of 8 MB that it was shown"
+    assert stats.result()[picture.key]["q50"].item() == pytest.approx(4, abs=0.02)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -244,18 +320,45 @@ def test_shards_are_whole_episodes_and_alike(seed):
     assert len(cut_into_shards(lengths[:20], most=500)) >= 10
 
 
+def paint(calvin, rng):
+    """Gives all pictures four corners of different brightness, in each channel other ones: a picture that is flipped,
+    turned, transposed or of another time is plainly another one.
+    """
+    for number, content in enumerate(calvin.frames.values()):
+        for name in ("rgb_static", "rgb_gripper"):
+            corners = np.stack([rng.permutation([0, 25, 50, 75]) for _ in range(3)]).reshape(3, 2, 2)
+            slope = np.linspace([1, 0], [0, 1], len(content[name]))
+            picture = np.moveaxis(slope @ corners @ slope.T, 0, -1) + 9 * (number % 20)
+            content[name] = picture.round().astype(np.uint8)
+    for frame in calvin.frames:
+        calvin.rewrite(frame)
+
+
+def frames_of_episodes(calvin, mode, dedup, overlap):
+    """Frame numbers of each episode to be; windows are of one length, and only neighbours overlap."""
+    if mode == "play":
+        return [list(calvin.frames)]
+    windows = calvin.windows
+    if overlap and dedup == "frames":
+        windows = windows[::2]
+    elif overlap and dedup == "task":
+        windows = [w for _, run in groupby(windows, key=lambda w: w[2]) for w in list(run)[::2]]
+    return [list(range(start, end)) for start, end, *_ in windows]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_random_folders_convert_exactly(tmp_path, seed):
-    """A property: whatever the folder and the options, lansar-verify finds every frame in its place."""
+    """A property: whatever the folder and the options, every frame that is due is there and in its place."""
     from dataset_convert.verify import VerifyConfig, verify
 
     rng = np.random.default_rng(seed)
     tasks = tuple(rng.choice(list(COMMANDS), rng.integers(2, 6)))
     length = int(rng.integers(4, 12))
+    scene, overlap = str(rng.choice(list(SCENES))), int(rng.integers(0, length // 2))
     calvin = write_calvin(
-        tmp_path / "calvin", rgb=True, scene=str(rng.choice(list(SCENES))), tasks=tasks, length=length,
-        overlap=int(rng.integers(0, length // 2)), seed=seed,
-    )  # fmt: skip
+        tmp_path / "calvin", rgb=True, scene=scene, tasks=tasks, length=length, overlap=overlap, seed=seed
+    )
+    paint(calvin, rng)
     changes = {
         "mode": str(rng.choice(["windows", "play"])),
         "images": str(rng.choice(["video", "png"])),
@@ -263,13 +366,17 @@ def test_random_folders_convert_exactly(tmp_path, seed):
     }
     if changes["mode"] == "windows":
         changes["dedup"] = str(rng.choice(["none", "task", "frames"]))
+    wanted = frames_of_episodes(calvin, changes["mode"], changes.get("dedup"), overlap)
     out = convert.convert(options(calvin, tmp_path / "out", **changes))
     report = verify(VerifyConfig("me/desk", calvin.root, out, min_psnr=35))
     assert f"{manifest_of(out)['request']['split']}" in report
     dataset = load(out)
-    for index in rng.integers(0, len(dataset), 5):
-        item = dataset[int(index)]
+    assert dataset.num_episodes == len(wanted)
+    assert column(dataset, "calvin.frame").tolist() == [frame for frames in wanted for frame in frames]
+    assert column(dataset, "episode_index").tolist() == [n for n, frames in enumerate(wanted) for _ in frames]
+    for item in dataset:
         source = calvin.frames[item["calvin.frame"].item()]
         np.testing.assert_array_equal(item["observation.state"], source["robot_obs"].astype(np.float32))
-        picture = source["rgb_static"].transpose(2, 0, 1) / 255
-        np.testing.assert_allclose(item["observation.images.static"], picture, atol=0.02)
+        for camera in ("static", "gripper"):
+            picture = source[f"rgb_{camera}"].transpose(2, 0, 1) / 255
+            np.testing.assert_allclose(item[f"observation.images.{camera}"], picture, atol=0.03)

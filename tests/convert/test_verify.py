@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 from fake_calvin import write_calvin
 
-from dataset_convert import verify
+from dataset_convert import checks, verify
+from dataset_convert import convert as convert_module
 from dataset_convert.convert import ConvertConfig, convert
 from dataset_convert.shards import sha256
 from dataset_convert.verify import Mismatch, VerifyConfig
@@ -39,17 +40,33 @@ def test_a_fresh_dataset_equals_its_source(tmp_path, options, episodes, frames, 
     assert told.count("pixel by pixel") == exact
 
 
+def shade(source):
+    """Makes every picture another one when it is flipped, transposed, of other colours or of the next frame."""
+    for frame, content in source.frames.items():
+        for camera in ("rgb_static", "rgb_gripper"):
+            slope = np.linspace(0, 110, len(content[camera]))
+            brightness = slope[:, None, None] + 0.4 * slope[:, None] + 10 * (frame % 10)
+            content[camera] = (brightness + [0, 5, 10]).astype(np.uint8)
+        source.rewrite(frame)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
+    """The source and two datasets of it: every episode in files of its own, and all in one."""
     folder = tmp_path_factory.mktemp("made")
     source = write_calvin(folder / "calvin", rgb=True)
-    return source, convert(ConvertConfig(source.root, "me/desk", folder / "out"))
+    shade(source)
+    out = convert(ConvertConfig(source.root, "me/desk", folder / "out"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(convert_module, "cut_into_shards", lambda lengths, most: [(0, len(lengths))])
+        one = convert(ConvertConfig(source.root, "me/desk", folder / "one"))
+    return source, out, one
 
 
 @pytest.fixture
 def copied(made, tmp_path):
     """(source, dataset) that a test may damage."""
-    source, out = made
+    source, out, _ = made
     shutil.copytree(source.root, tmp_path / "calvin")
     shutil.copytree(out, tmp_path / "out")
     return type(source)(tmp_path / "calvin", source.windows, source.frames), tmp_path / "out"
@@ -135,6 +152,8 @@ DAMAGES = {
         data("timestamp", lambda rows: [i / 24 for i in range(len(rows))]),
         "column timestamp",
     ),
+    "an episode that is not listed": (data("episode_index", lambda rows: [9] * len(rows)), "other episodes than 0-3"),
+    "an episode in two files": (data("episode_index", lambda rows: [1] * len(rows)), "is in another file too"),
     "frames in another order": (data("calvin.frame", lambda rows: rows[::-1]), "column calvin.frame"),
     "a frame too early": (video(lambda p: p[1:] + p[-1:]), "the video is a frame"),
     "a frame too late": (video(lambda p: p[:1] + p[:-1]), "the video is a frame"),
@@ -143,6 +162,17 @@ DAMAGES = {
     "red and blue swapped": (
         video(lambda p: [np.ascontiguousarray(x[..., ::-1]) for x in p]),
         "red and blue are exchanged",
+    ),
+    "pictures upside down": (video(lambda p: [x[::-1].copy() for x in p]), "PSNR"),
+    "pictures mirrored": (video(lambda p: [x[:, ::-1].copy() for x in p]), "PSNR"),
+    "pictures transposed": (video(lambda p: [x.transpose(1, 0, 2).copy() for x in p]), "PSNR"),
+    "pictures of another size": (video(lambda p: [x[:100].copy() for x in p]), r"\(100, 200, 3\), the source's"),
+    "height and width exchanged": (
+        lambda _, out: change_json(
+            out / "meta/info.json",
+            lambda i: i["features"]["observation.images.static"].update(names=["width", "height", "channels"]),
+        ),
+        r"info.json: .*static is .*'width', 'height'.*, expected \[200, 200, 3\] \['height', 'width', 'channels'\]",
     ),
     "bad pictures": (video(noise), "PSNR .* dB, --min_psnr=22"),
     "wrong statistics": (
@@ -160,6 +190,18 @@ DAMAGES = {
     "the number of frames": (
         lambda _, out: change_json(out / "meta/info.json", lambda i: i.update(total_frames=47)),
         "info.json says",
+    ),
+    "another sentence in the manifest": (
+        lambda _, out: change_json(
+            out / "meta/calvin_source.json", lambda m: m["windows"][0].update(sentence="do something")
+        ),
+        "windows are not what",
+    ),
+    "other task numbers": (
+        lambda _, out: change_json(
+            out / "meta/calvin_source.json", lambda m: m.update(task_names=sorted(m["task_names"]))
+        ),
+        "task_names are not what",
     ),
     "a file too few": (lambda _, out: (out / VIDEO).unlink(), "missing or surplus files: videos"),
     "a file too many": (
@@ -188,13 +230,135 @@ def test_every_damage_is_found(copied, damage):
         verify.verify(VerifyConfig("me/desk", source.root, out))
 
 
-def test_a_changed_file_is_found_by_its_hash(copied):
+FILES = [
+    VIDEO,
+    DATA,
+    "meta/info.json",
+    "meta/stats.json",
+    "meta/tasks.parquet",
+    "meta/episodes/chunk-000/file-001.parquet",
+]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_changed_file_is_found_by_its_hash(copied, name):
     source, out = copied
-    with open(out / VIDEO, "r+b") as file:
-        file.seek(-1, 2)
-        file.write(b"!")
-    with pytest.raises(Mismatch, match=r"file-001.mp4 was changed since it was converted"):
+    with open(out / name, "ab") as file:
+        file.write(b" ")
+    with pytest.raises(Mismatch, match=f"{name} was changed since it was converted"):
         verify.verify(VerifyConfig("me/desk", source.root, out))
+
+
+def test_a_file_that_nobody_listed_is_found(copied):
+    source, out = copied
+    shutil.copy(out / "meta/info.json", out / "meta/info_old.json")
+    with pytest.raises(Mismatch, match="missing or surplus files: meta/info_old"):
+        verify.verify(VerifyConfig("me/desk", source.root, out))
+
+
+STATIC = "videos/observation.images.static"
+PLACES = {
+    f"{STATIC}/from_timestamp": lambda rows: [0.0] * len(rows),
+    f"{STATIC}/to_timestamp": lambda rows: [x + 1 / 30 for x in rows],
+    f"{STATIC}/chunk_index": lambda rows: [1] * len(rows),
+    f"{STATIC}/file_index": lambda rows: [*rows[:-1], rows[-1] + 1],
+    "data/chunk_index": lambda rows: [1] * len(rows),
+    "data/file_index": lambda rows: [*rows[:-1], rows[-1] + 1],
+    "dataset_from_index": lambda rows: [*rows[:1], *(x + 1 for x in rows[1:])],
+    "dataset_to_index": lambda rows: [x - 1 for x in rows],
+    "meta/episodes/file_index": lambda rows: [x + 1 for x in rows],
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_wrong_place_of_an_episode_is_found(made, tmp_path, name):
+    source, _, one = made
+    out = shutil.copytree(one, tmp_path / "out")
+    change_column(out / "meta/episodes/chunk-000/file-000.parquet", name, PLACES[name])
+    bless(out)
+    with pytest.raises(Mismatch, match=f"meta/episodes.*{name}.*"):
+        verify.verify(VerifyConfig("me/desk", source.root, out))
+
+
+def test_all_episodes_in_one_file_are_right_too(made):
+    source, _, one = made
+    assert "4 episodes, 48 frames equal" in verify.verify(VerifyConfig("me/desk", source.root, one))
+
+
+@pytest.fixture
+def defective(calvin, tmp_path, monkeypatch):
+    """Converts with a converter that has a defect: a function of it that is replaced."""
+
+    def make(module, name, replacement, **options):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, replacement)
+            return convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none", **options))
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda spans: spans[:2] + spans[3:], r"1 episodes are missing and not .*124-135, windows \[2\]"),
+        (lambda spans: spans[::-1], "in another order"),
+        (lambda spans: [*spans, spans[0]], "there twice"),
+        (
+            lambda spans: [*spans, verify.Span(100, 105, "D", (0,))],
+            "not asked for; the first: frames 100-104",
+        ),
+    ],
+    ids=["dropped", "another order", "twice", "too many"],
+)
+def test_episodes_that_the_converter_drops_or_invents_are_found(calvin, defective, change, message):
+    right = convert_module.window_spans
+    out = defective(convert_module, "window_spans", lambda *a: change(right(*a)))
+    with pytest.raises(Mismatch, match=message):
+        verify.verify(VerifyConfig("me/desk", calvin.root, out))
+
+
+def test_a_recording_that_the_converter_drops_is_found(calvin, defective):
+    np.save(calvin.root / "training/ep_start_end_ids.npy", np.array([(100, 123), (124, 147)]))
+    right = convert_module.play_spans
+    out = defective(convert_module, "play_spans", lambda *a: right(*a)[1:], mode="play")
+    with pytest.raises(Mismatch, match="1 episodes are missing and not listed"):
+        verify.verify(VerifyConfig("me/desk", calvin.root, out))
+
+
+def test_blocks_that_the_converter_takes_for_others_are_found(calvin, defective):
+    out = defective(checks, "block_order", lambda *_: ("blue", "red", "pink"))
+    with pytest.raises(Mismatch, match=r"scenes are not what .*'blue', 'red', 'pink'.*'red', 'blue', 'pink'"):
+        verify.verify(VerifyConfig("me/desk", calvin.root, out))
+    path = out / "meta/calvin_source.json"
+    change_json(path, lambda m: m["scenes"]["D"].update(block_order=["red", "blue", "pink"]))
+    with pytest.raises(Mismatch, match="environment_state is not what the source"):
+        verify.verify(VerifyConfig("me/desk", calvin.root, out))
+
+
+def test_what_was_left_out_is_counted_and_no_path_of_this_machine_is_told(calvin, tmp_path):
+    calvin.rewrite(113, actions=np.full(7, np.nan))
+    calvin.file(130).unlink()
+    out = convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none", skip_bad=True))
+    told = verify.verify(VerifyConfig("me/desk", calvin.root, out))
+    assert "2 episodes, 24 frames equal" in told
+    assert "2 defective episodes are listed as left out" in told
+    manifest = (out / "meta/calvin_source.json").read_text()
+    assert '"training/episode_0000113.npz: ' in manifest
+    assert str(tmp_path) not in manifest + (out / "README.md").read_text()
+    change_json(out / "meta/calvin_source.json", lambda m: m["request"].update(skip_bad=False))
+    with pytest.raises(Mismatch, match="left out without --skip_bad=true"):
+        verify.verify(VerifyConfig("me/desk", calvin.root, out))
+
+
+def test_frames_of_both_splits_are_those_of_the_source(calvin, tmp_path):
+    (calvin.root / "validation").mkdir()
+    shutil.copy(calvin.file(105), calvin.root / "validation")
+    out = convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none", exclude_shared=True))
+    config = VerifyConfig("me/desk", calvin.root, out)
+    assert "3 episodes, 36 frames equal" in verify.verify(config)
+    shutil.copy(calvin.file(113), calvin.root / "validation")
+    with pytest.raises(Mismatch, match="training and validation share frames 105, 113, it says 105"):
+        verify.verify(config)
 
 
 def test_another_source_is_refused(copied, tmp_path):
