@@ -177,6 +177,12 @@ def convert(config: ConvertConfig) -> Path:
     split = CalvinSplit(config.root, config.split)
     request = config.request(split)
     if _is_done(config.target, request):
+        kept = json.loads((config.target / "meta/calvin_source.json").read_text())["license"]
+        if kept != config.license:  # no option is the default, which must not change what was published
+            raise ValueError(
+                f"--license={config.license}: {config.target} was made with --license={kept}: repeat that, or change "
+                "`license` in its meta/calvin_source.json"
+            )
         print(f"{config.target} already holds this conversion", file=sys.stderr)
         publish.tidy(config.target)
         _after(config, split)

@@ -181,6 +181,14 @@ def test_a_fault_of_the_machine_is_no_defect_of_the_data(calvin, tmp_path, monke
     assert json.loads((tmp_path / "out/meta/calvin_source.json").read_text())["left_out"] == []
 
 
+def test_a_finished_datasets_licence_is_not_changed_in_passing(calvin, tmp_path):
+    out = convert.convert(options(calvin, tmp_path / "out", license="cc-by-4.0"))
+    before = files_of(out)
+    with pytest.raises(ValueError, match=r"--license=mit: .* was made with --license=cc-by-4.0"):
+        convert.convert(options(calvin, out))
+    assert files_of(convert.convert(options(calvin, out, license="cc-by-4.0"))) == before
+
+
 def workers_of(parent):
     """Processes of a session, but not the one that began it."""
     found = []
