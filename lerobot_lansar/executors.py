@@ -111,6 +111,7 @@ def run_shards(
 
     Raises:
         WorkerDied: A local worker was killed; the same call goes on where it stopped.
+        ValueError: The local executor was not called from the main thread, which alone can be woken.
         subprocess.CalledProcessError: Slurm refused a job; those it had taken are cancelled.
         Exception: Whatever ``work`` or ``finish`` raised.
     """
@@ -222,8 +223,12 @@ os.register_at_fork(after_in_child=lambda: _end_with_parent() if _watching else 
 
 @contextlib.contextmanager
 def _watched(progress: Callable[[], int], total: int, unit: str, desc: str) -> Iterator[None]:
-    """A bar. A pool waits forever for a local worker that was killed: here that ends in WorkerDied."""
+    """A bar. A pool waits forever for a local worker that was killed: here that ends in WorkerDied.
+
+    The waiting thread is woken by a signal of our own: a job that a script left in the background ignores SIGINT.
+    """
     ended, died = threading.Event(), threading.Event()
+    before = signal.signal(signal.SIGUSR1, signal.default_int_handler)
 
     def watch() -> None:
         known: set[int] = set()
@@ -234,9 +239,9 @@ def _watched(progress: Callable[[], int], total: int, unit: str, desc: str) -> I
                 pool = {p.pid for p in multiprocess.active_children() if "PoolWorker" in p.name}
                 if known - pool and progress() < total and not ended.wait(_GRACE):
                     died.set()
-                    os.kill(os.getpid(), signal.SIGINT)
+                    os.kill(os.getpid(), signal.SIGUSR1)
                     while not ended.wait(2 * _GRACE):  # the pool's end hangs too if the dead one held a lock
-                        os.kill(os.getpid(), signal.SIGINT)
+                        os.kill(os.getpid(), signal.SIGUSR1)
                     return
                 known = pool
             bar.update(progress() - bar.n)
@@ -254,3 +259,4 @@ def _watched(progress: Callable[[], int], total: int, unit: str, desc: str) -> I
     finally:
         ended.set()
         thread.join()
+        signal.signal(signal.SIGUSR1, before)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -175,7 +176,8 @@ def test_a_pool_that_hangs_after_a_worker_died_is_interrupted_until_it_ends(monk
     monkeypatch.setattr(executors, "_GRACE", 0.2)
     pools = iter([[SimpleNamespace(pid=1, name="PoolWorker-1")]])
     monkeypatch.setattr(executors.multiprocess, "active_children", lambda: next(pools, []))
-    interrupted = []
+    interrupted, before = [], signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a job that a script left in the background
 
     def hang():
         with executors._watched(lambda: 0, 1, "shard", "working"):
@@ -185,8 +187,11 @@ def test_a_pool_that_hangs_after_a_worker_died_is_interrupted_until_it_ends(monk
                 interrupted.append(True)
                 time.sleep(30)
 
-    with pytest.raises(executors.WorkerDied, match="a worker process was killed"):
-        hang()
+    try:
+        with pytest.raises(executors.WorkerDied, match="a worker process was killed"):
+            hang()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert interrupted == [True]
 
 
