@@ -177,18 +177,22 @@ def record(config: RecordConfig) -> Path:
         if config.executor == "slurm":
             (staging / SUBMITTED).touch()
         total = sum(config.counts())
-        done = run_shards(
-            (record_shard, (config,)),
-            -(-total // config.shard_size()),
-            (publish, (config, kinds.pop())),
-            executor=config.executor,
-            workers=config.workers,
-            slurm=config.slurm,
-            logging_dir=output / SLURM_LOGS if config.executor == "slurm" else staging / "jobs",
-            progress=lambda: len(list(staging.glob("[0-9]*.json"))),
-            total=total,
-            unit="episode" if config.mode == "windows" else "session",
-        )
+        try:
+            done = run_shards(
+                (record_shard, (config,)),
+                -(-total // config.shard_size()),
+                (publish, (config, kinds.pop())),
+                executor=config.executor,
+                workers=config.workers,
+                slurm=config.slurm,
+                logging_dir=output / SLURM_LOGS if config.executor == "slurm" else staging / "jobs",
+                progress=lambda: len(list(staging.glob("[0-9]*.json"))),
+                total=total,
+                unit="episode" if config.mode == "windows" else "session",
+            )
+        except BaseException:
+            (staging / SUBMITTED).unlink(missing_ok=True)  # nothing is on its way
+            raise
     if not done:
         print(f"submitted; {output / SPLITS[0]} and {output / SPLITS[1]} appear when the jobs are done")
     return output

@@ -16,7 +16,7 @@ from lerobot_lansar.demos.record import SPLITS, RecordConfig, place_of_unit, rec
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, DeskError
 from lerobot_lansar.desk.commands import COMMANDS
-from lerobot_lansar.executors import WorkerDied
+from lerobot_lansar.executors import SlurmConfig, WorkerDied
 
 
 def options(output_dir, **changes):
@@ -278,6 +278,20 @@ def test_a_mistaken_request_can_be_corrected_before_anything_was_recorded(tmp_pa
         with pytest.raises(OSError, match="no"):
             record(options(tmp_path / "desk", seed=8))
     record(options(tmp_path / "desk", seed=9, episodes=1, validation_episodes=1))
+
+
+def test_a_refused_submission_leaves_no_mark_of_jobs_under_way(tmp_path, monkeypatch):
+    (tmp_path / "sbatch").write_text("#!/bin/sh\n")
+    (tmp_path / "sbatch").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+
+    def refused(*_, **__):
+        raise subprocess.CalledProcessError(1, ["sbatch"])
+
+    monkeypatch.setattr(record_module, "run_shards", refused)
+    for _ in range(2):  # again, and not "were submitted already"
+        with pytest.raises(subprocess.CalledProcessError):
+            record(options(tmp_path / "desk", executor="slurm", slurm=SlurmConfig(partition="cpu")))
 
 
 def test_validation_is_not_a_part_of_a_longer_training(tmp_path):
