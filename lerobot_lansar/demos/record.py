@@ -308,14 +308,12 @@ def publish(config: RecordConfig, kind: str, _: int) -> None:
     units = [Unit.load(_note(config, index)) for index in range(training + validation)]
     (staging / PUBLISHING).touch()
     frame = 0
-    for split, indices in (
-        ("training", range(training)),
-        ("validation", range(training, training + validation)),
-    ):
+    parts = range(training), range(training, training + validation)
+    for number, (split, indices) in enumerate(zip(SPLITS, parts, strict=True)):
         commands = load_commands(_annotations(config, split), split)
         rows = [
-            (staging / f"{index:06d}", units[index], _say(commands, units[index], config, index))
-            for index in indices
+            (staging / f"{index:06d}", units[index], _say(commands, units[index], [config.seed, number, k]))
+            for k, index in enumerate(indices)
         ]
         shutil.rmtree(output / split, ignore_errors=True)  # of a try that ended between the two
         frame = publish_split(output / split, rows, frame, details, benchmark)
@@ -323,10 +321,9 @@ def publish(config: RecordConfig, kind: str, _: int) -> None:
     print(summary(config, units))
 
 
-def _say(commands: dict[str, list[str]], unit: Unit, config: RecordConfig, index: int) -> list[str]:
-    """A random sentence for each of a unit's windows."""
-    place = place_of_unit(config, index)
-    rng = np.random.default_rng([config.seed, SPLITS.index(place.split), place.number, ATTEMPTS])
+def _say(commands: dict[str, list[str]], unit: Unit, seed: list[int]) -> list[str]:
+    """A random sentence for each of a unit's windows; ``seed`` says which unit of which split."""
+    rng = np.random.default_rng([*seed, ATTEMPTS])
     return [commands[task][int(rng.integers(len(commands[task])))] for *_, task in unit.windows]
 
 
