@@ -44,8 +44,22 @@ THESIS_RULES = [
     "--policy.yaw_scale=1.5",
     "--policy.window_slide=1",
 ]
+THESIS = [
+    *ACHIEVED,
+    "--policy.orientation=euler",
+    "--policy.egocentric_blocks=false",
+    "--policy.command_in_context=false",
+    "--policy.mlp_norm=batch",
+    "--policy.dropout=0.1",
+    "--policy.window=64",
+    "--policy.window_start=episode",
+    "--batch_size=24",
+]
+"""Every choice of configs/thesis/baseline.yaml that is not a size, and as many steps an update; without pictures."""
 VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "recommended": ([], []),
+    "thesis (No Image) at this size": (THESIS, THESIS_RULES),
+    "thesis (No Image) at this size, Prepend": ([*THESIS, "--policy.command_prepended=true"], THESIS_RULES),
     "achieved targets, thesis constants": (ACHIEVED, THESIS_RULES),
     "achieved targets, as predicted": (ACHIEVED, []),
     "euler angles": (["--policy.orientation=euler"], []),

@@ -11,6 +11,7 @@ from dataset_convert.calvin import COLOURS
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
+_ACTION = {"rel": _REL, "abs": f"{_ABS}; the roll in [0, 2π), where a hand that points down has no jump"}
 
 _MEANING = {
     "observation.state": "`robot_obs`: TCP pose (m, rad), gripper width (m), 7 joints (rad), gripper action",
@@ -123,9 +124,9 @@ def _features(info: dict[str, Any], action: str) -> str:
         if not key.startswith(("observation.", "action", "calvin.")):
             continue
         shape = "×".join(str(size) for size in feature["shape"])
-        text = (
-            (_REL if action == "rel" else _ABS) if key == "action" else _MEANING.get(key, "fingertip sensor")
-        )
+        text = _ACTION[action] if key == "action" else _MEANING.get(key, "fingertip sensor")
+        if key == "observation.environment_state" and shape != "24":
+            text += "; then 1 for the commanded task, 0 for the others (`names` of `meta/info.json`)"
         rows.append(f"| `{key}` | {shape} | {feature['dtype']} | {text} |")
     return "\n".join(rows)
 

@@ -180,6 +180,17 @@ def block_votes(split: CalvinSplit, scene: str) -> np.ndarray:
     return votes
 
 
+def without_roll_jump(actions: np.ndarray) -> np.ndarray:
+    """Absolute actions (n, 7) with the roll in [0, 2 pi) instead of (-pi, pi].
+
+    The hand points down, so CALVIN's roll jumps between pi and -pi, and a policy that learns it by regression learns
+    their mean, a hand that points up. Everybody who takes actions takes any turn of an angle.
+    """
+    turned = actions.copy()
+    turned[:, 3] %= 2 * np.pi
+    return turned
+
+
 def reorder_blocks(scene_obs: np.ndarray, order: tuple[str, ...]) -> np.ndarray:
     """Puts the blocks into red, blue, pink order.
 

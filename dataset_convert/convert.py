@@ -69,6 +69,9 @@ class ConvertConfig:
     skip_bad: bool = False
     # what `action` holds: rel (relative) or abs (absolute); the other form is kept in another column
     action: str = "rel"
+    # tell policies that read no language what is asked for: 34 more numbers in observation.environment_state, 1 for the
+    # commanded task and 0 for the others
+    task_in_state: bool = False
     # both cameras as video, as png in the parquet files, or none
     images: str = "video"
     # store the cameras' distances too
@@ -139,6 +142,7 @@ class ConvertConfig:
             "source_sha256": split.source_sha256,
             **{name: getattr(self, name) for name in names},
             "rgb_encoder": encoder,
+            **({"task_in_state": True} if self.task_in_state else {}),
         }
 
 
@@ -269,11 +273,15 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
         if order != checks.SCENE_BLOCK_ORDER.get(scene):
             _say(f"scene {scene}: block columns are {', '.join(order)}, as its lifts show")
     names = {window.task for window in split.windows}
+    if config.task_in_state and not names <= set(TASKS):
+        raise ValueError(
+            f"--task_in_state=true: {', '.join(sorted(names - set(TASKS)))} is none of CALVIN's {len(TASKS)} tasks"
+        )
 
     from dataset_convert import features
 
     pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder)
-    info = features.empty_info(config.action, pictures)
+    info = features.empty_info(config.action, pictures, config.task_in_state)
     job = Job(
         split=split,
         folder=publish.staging_of(config.target),
@@ -281,6 +289,7 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
         shards=cut_into_shards([len(span) for span in spans], FRAMES_PER_SHARD),
         layout=features.layout_of(info, pictures),
         action=config.action,
+        task_in_state=config.task_in_state,
         block_orders=orders,
         tasks=_sentences(split, spans),
         task_names=[*TASKS, *sorted(names - set(TASKS))],

@@ -13,7 +13,7 @@ from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, Datase
 from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from dataset_convert.calvin import CAMERAS, COLOURS, DEPTH, FPS, TACTILE
+from dataset_convert.calvin import CAMERAS, COLOURS, DEPTH, FPS, TACTILE, TASKS
 from dataset_convert.writer import Codec, Layout, Picture, RGBEncoder, Stats
 
 _REL_NAMES = ["delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper"]
@@ -26,6 +26,7 @@ _STATE_NAMES = [
 _SCENE_NAMES = ["slider", "drawer", "button", "switch", "lightbulb", "led"] + [
     f"{colour}_block_{axis}" for colour in COLOURS for axis in ("x", "y", "z", "roll", "pitch", "yaw")
 ]
+_TASK_NAMES = [f"task_{task}" for task in TASKS]
 _NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
 
 
@@ -89,13 +90,16 @@ def _depth_codec() -> Codec:
     return Codec(config.vcodec, config.pix_fmt, config.get_codec_options(1, as_strings=True), quantizer)
 
 
-def dataset_features(action: str, pictures: tuple[Picture, ...]) -> dict[str, dict]:
+def dataset_features(
+    action: str, pictures: tuple[Picture, ...], task_in_state: bool = False
+) -> dict[str, dict]:
     """LeRobot's description of the dataset's columns.
 
     Args:
         action: "rel" or "abs", the form that ``action`` holds; the other one is kept as ``calvin.…``, a name that
             LeRobot does not take for something a policy should predict.
         pictures: camera features.
+        task_in_state: the scene's state also says which task is commanded.
 
     Returns:
         Feature name -> {"dtype", "shape", "names"}, LeRobot's own columns (``index``, …) included.
@@ -107,7 +111,7 @@ def dataset_features(action: str, pictures: tuple[Picture, ...]) -> dict[str, di
     other = "calvin.actions" if action == "rel" else "calvin.rel_actions"
     features = {
         "observation.state": vector(_STATE_NAMES),
-        "observation.environment_state": vector(_SCENE_NAMES),
+        "observation.environment_state": vector([*_SCENE_NAMES, *(_TASK_NAMES if task_in_state else ())]),
         "action": vector(_REL_NAMES if action == "rel" else _ABS_NAMES),
         other: vector(_ABS_NAMES if action == "rel" else _REL_NAMES),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
@@ -123,11 +127,11 @@ def dataset_features(action: str, pictures: tuple[Picture, ...]) -> dict[str, di
     return {**features, **DEFAULT_FEATURES}
 
 
-def empty_info(action: str, pictures: tuple[Picture, ...]) -> DatasetInfo:
+def empty_info(action: str, pictures: tuple[Picture, ...], task_in_state: bool) -> DatasetInfo:
     """The dataset's description before anything was written."""
     has_videos = any(picture.codec for picture in pictures)
     return create_empty_dataset_info(
-        CODEBASE_VERSION, FPS, dataset_features(action, pictures), has_videos, "panda"
+        CODEBASE_VERSION, FPS, dataset_features(action, pictures, task_in_state), has_videos, "panda"
     )
 
 

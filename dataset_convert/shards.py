@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dataset_convert import checks, publish
-from dataset_convert.calvin import VECTORS, CalvinSplit
+from dataset_convert.calvin import TASKS, VECTORS, CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
 from dataset_convert.writer import Block, Layout, Place, Written, digest, write_shard
 
@@ -43,6 +43,7 @@ class Job:
     shards: list[tuple[int, int]]
     layout: Layout
     action: str
+    task_in_state: bool
     block_orders: dict[str, tuple[str, ...]]
     tasks: list[str]
     task_names: list[str]
@@ -198,26 +199,29 @@ def to_block(
         windows: (n,) the window each belongs to, or -1.
         arrays: CALVIN's arrays.
     """
-    main, other = ("rel_actions", "actions") if job.action == "rel" else ("actions", "rel_actions")
-    columns = {
-        "observation.state": arrays["robot_obs"],
-        "observation.environment_state": checks.reorder_blocks(
-            arrays["scene_obs"], job.block_orders[span.scene]
-        ),
-        "action": arrays[main],
-        f"calvin.{other}": arrays[other],
-    }
-    columns = {key: column.astype(np.float32) for key, column in columns.items()}
     # -1, "none", is a window that does not exist, a task and a sentence for play without a command
     listed = job.split.windows
     task_of = {n: job.task_names.index(listed[n].task) if n >= 0 else -1 for n in set(windows.tolist())}
+    tasks = np.array([task_of[n] for n in windows.tolist()])
+    scene = checks.reorder_blocks(arrays["scene_obs"], job.block_orders[span.scene])
+    if job.task_in_state:
+        scene = np.concatenate([scene, tasks[:, None] == np.arange(len(TASKS))], axis=1)
+    absolute = job.action == "abs"
+    other = "calvin.rel_actions" if absolute else "calvin.actions"
+    columns = {
+        "observation.state": arrays["robot_obs"],
+        "observation.environment_state": scene,
+        "action": checks.without_roll_jump(arrays["actions"]) if absolute else arrays["rel_actions"],
+        other: arrays["rel_actions" if absolute else "actions"],
+    }
+    columns = {key: column.astype(np.float32) for key, column in columns.items()}
     sentence_of = {n: job.tasks.index(listed[n].sentence if n >= 0 else NO_COMMAND) for n in task_of}
     columns["calvin.frame"] = np.arange(frames.start, frames.stop)
     columns["calvin.window"] = windows
-    columns["calvin.task"] = np.array([task_of[n] for n in windows.tolist()])
+    columns["calvin.task"] = tasks
     columns["calvin.scene"] = np.full(len(frames), job.scene_names.index(span.scene))
-    tasks = np.array([sentence_of[n] for n in windows.tolist()])
-    return Block(columns, tasks, {key: arrays[key] for key in job.arrays() if key in arrays})
+    sentences = np.array([sentence_of[n] for n in windows.tolist()])
+    return Block(columns, sentences, {key: arrays[key] for key in job.arrays() if key in arrays})
 
 
 class _Progress:

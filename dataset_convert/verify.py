@@ -438,22 +438,25 @@ def _wanted(
     start = sum(len(before) for before in dataset.spans[:episode]) + first
     windows = dataset.windows[episode][first : first + n]
     listed = dataset.split.windows
-    forms = (
-        ("rel_actions", "actions") if manifest["request"]["action"] == "rel" else ("actions", "rel_actions")
-    )
+    tasks = np.array([manifest["task_names"].index(listed[w].task) if w >= 0 else -1 for w in windows])
+    action, other = source["rel_actions"], source["actions"]
+    if manifest["request"]["action"] == "abs":
+        action, other = source["actions"].copy(), source["rel_actions"]
+        action[:, 3] %= 2 * np.pi
     order = dataset.orders[span.scene]
     blocks = [6 + 6 * order.index(colour) + i for colour in checks.COLOURS for i in range(6)]
+    scene = source["scene_obs"][:, [*range(6), *blocks]]
+    if manifest["request"].get("task_in_state"):
+        scene = np.hstack([scene, np.eye(len(TASKS) + 1)[tasks, :-1]])  # the last row, of -1, is all zeros
     number = {sentence: index for index, sentence in dataset.sentence.items()}
     return {
         "observation.state": source["robot_obs"].astype(np.float32),
-        "observation.environment_state": source["scene_obs"][:, [*range(6), *blocks]].astype(np.float32),
-        "action": source[forms[0]].astype(np.float32),
-        f"calvin.{forms[1]}": source[forms[1]].astype(np.float32),
+        "observation.environment_state": scene.astype(np.float32),
+        "action": action.astype(np.float32),
+        "calvin.actions" if other is source["actions"] else "calvin.rel_actions": other.astype(np.float32),
         "calvin.frame": np.arange(span.start + first, span.start + first + n),
         "calvin.window": windows,
-        "calvin.task": np.array(
-            [manifest["task_names"].index(listed[w].task) if w >= 0 else -1 for w in windows]
-        ),
+        "calvin.task": tasks,
         "calvin.scene": np.full(n, manifest["scene_names"].index(span.scene)),
         "timestamp": (np.arange(first, first + n) / FPS).astype(np.float32),
         "frame_index": np.arange(first, first + n),

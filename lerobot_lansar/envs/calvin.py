@@ -40,8 +40,9 @@ class CalvinEnv(gym.Env):
 
     Observation space:
         ``agent_pos`` (15,): CALVIN's robot_obs. ``environment_state`` (24,): CALVIN's scene_obs, blocks red, blue,
-        pink; privileged simulator state. ``pixels``: ``static`` (200, 200, 3) and ``gripper`` (84, 84, 3) uint8, those
-        asked for by ``cameras``. ``control_mode`` (1,): 0 relative, 1 absolute; policies check it.
+        pink; privileged simulator state (58 numbers with ``task_in_state``). ``pixels``: ``static`` (200, 200, 3) and
+        ``gripper`` (84, 84, 3) uint8, those asked for by ``cameras``. ``control_mode`` (1,): 0 relative, 1 absolute;
+        policies check it.
 
     Rewards: 1 for each fulfilled command, judged by CALVIN's oracle after every step; 0 otherwise. The return of a
         chain is the number of commands fulfilled in a row, its mean over chains CALVIN's average length.
@@ -72,6 +73,9 @@ class CalvinEnv(gym.Env):
             draws depend on the episode's seed.
         perturbation_scale: Gamma of that equation.
         render_fps: How often ``render`` draws a new picture; in between it returns the last one again.
+        task_in_state: ``environment_state`` also holds a number for each of the 34 tasks, 1 for the one that is
+            commanded and 0 for the others: for policies that read no language (ACT, Diffusion, VQ-BeT), trained on
+            what ``lansar-convert --task_in_state=true`` makes.
         render_mode: ``"rgb_array"``, the static camera's picture.
 
     Version: v0.
@@ -93,6 +97,7 @@ class CalvinEnv(gym.Env):
         perturbation_every: int = 0,
         perturbation_scale: float = 0.0,
         render_fps: int = CONTROL_HZ,
+        task_in_state: bool = False,
         render_mode: str | None = "rgb_array",
     ):
         if task != LH_MTLC and task not in TASKS:
@@ -139,7 +144,8 @@ class CalvinEnv(gym.Env):
         self._last: Observation = {}
         self._done: list[dict[str, Any]] = []
         self.task_description = "" if task == LH_MTLC else self._sentences[task][0]
-        self.observation_space = _observation_space(tuple(cameras))
+        self.task_in_state = task_in_state
+        self.observation_space = _observation_space(tuple(cameras), environment_state_size(task_in_state))
         self.action_space = _action_space(control_mode)
 
     def reset(
@@ -244,11 +250,14 @@ class CalvinEnv(gym.Env):
         self._start: Snapshot = self._desk.snapshot()
         self._command_steps = 0
         self.task_description = self._sentences[self._current][0]
+        self._told = np.array([task == self._current for task in TASKS], dtype=np.float64)
 
     def _observation(self, obs: dict[str, np.ndarray]) -> dict[str, Any]:
         observation: dict[str, Any] = {
             "agent_pos": obs["robot_obs"],
-            "environment_state": obs["scene_obs"],
+            "environment_state": np.concatenate([obs["scene_obs"], self._told])
+            if self.task_in_state
+            else obs["scene_obs"],
             "control_mode": np.array([CONTROL_MODES.index(self.control_mode)], dtype=np.float32),
         }
         cameras = self._desk_options["cameras"]
@@ -306,8 +315,13 @@ class CalvinEnv(gym.Env):
             file.write(json.dumps(result) + "\n")
 
 
-def _observation_space(cameras: tuple[str, ...]) -> spaces.Dict:
-    numbers = {"agent_pos": 15, "environment_state": 24}
+def environment_state_size(task_in_state: bool) -> int:
+    """How many numbers ``environment_state`` has."""
+    return 24 + (len(TASKS) if task_in_state else 0)
+
+
+def _observation_space(cameras: tuple[str, ...], scene_size: int) -> spaces.Dict:
+    numbers = {"agent_pos": 15, "environment_state": scene_size}
     entries: dict[str, spaces.Space] = {
         key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in numbers.items()
     }

@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from ..desk import Desk
 from ..desk.cameras import CAMERAS
 from ..desk.errors import DeskError
-from .calvin import LH_MTLC, CalvinEnv
+from .calvin import LH_MTLC, CalvinEnv, environment_state_size
 
 
 @EnvConfig.register_subclass("calvin")
@@ -38,6 +38,7 @@ class CalvinEnvConfig(EnvConfig):
     perturbation_every: int = 0
     perturbation_scale: float = 0.0
     render_fps: int = 30
+    task_in_state: bool = False
 
     def __post_init__(self) -> None:
         if self.max_parallel_tasks != 1:
@@ -48,7 +49,9 @@ class CalvinEnvConfig(EnvConfig):
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (7,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (15,)),
-            "environment_state": PolicyFeature(FeatureType.ENV, (24,)),
+            "environment_state": PolicyFeature(
+                FeatureType.ENV, (environment_state_size(self.task_in_state),)
+            ),
         }
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
         for camera in self.cameras:
@@ -77,6 +80,7 @@ class CalvinEnvConfig(EnvConfig):
             "renderer",
             "perturbation_every",
             "perturbation_scale",
+            "task_in_state",
         )
         return {name: getattr(self, name) for name in names} | {"render_fps": self.render_fps}
 

@@ -200,7 +200,8 @@ class LanSARConfig(PreTrainedConfig):
             raise ValueError(
                 f"LanSAR cannot use these features: {'; '.join(problems)}. It needs observation.state (15,), "
                 "observation.environment_state (24,) and action (7,) in CALVIN's conventions, as "
-                "lansar-convert writes them and --env.type=calvin provides them."
+                "lansar-convert writes them and --env.type=calvin provides them, without task_in_state: LanSAR reads "
+                "the command itself."
             )
         if not self.use_images and self.input_features:
             for name in [k for k, f in self.input_features.items() if f.type is FeatureType.VISUAL]:

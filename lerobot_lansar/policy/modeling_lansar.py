@@ -201,7 +201,12 @@ class LanSARPolicy(PreTrainedPolicy):
         sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, SCENE_DIM + 18))
         for name, value, size in sizes:
             if value.ndim != 2 or value.shape[1] != size:
-                raise ValueError(f"{name} must be (B, {size}), got {tuple(value.shape)}.")
+                told = (
+                    " LanSAR reads the command itself: --env.task_in_state=false."
+                    if name == OBS_ENV_STATE
+                    else ""
+                )
+                raise ValueError(f"{name} must be (B, {size}), got {tuple(value.shape)}.{told}")
             if not value.isfinite().all():
                 rows = (~value.isfinite().all(dim=1)).nonzero().flatten().tolist()
                 raise ValueError(f"{name} is NaN or infinite in environment {rows} of the batch.")

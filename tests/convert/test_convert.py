@@ -17,7 +17,7 @@ import pytest
 from fake_calvin import COMMANDS, write_calvin
 
 from dataset_convert import checks, convert, publish
-from dataset_convert.calvin import COLOURS, CalvinSplit
+from dataset_convert.calvin import COLOURS, TASKS, CalvinSplit
 from dataset_convert.convert import ClipOptions, ConvertConfig
 
 
@@ -58,10 +58,50 @@ def test_every_item_is_the_source_frame_with_its_command(tmp_path):
 
 def test_absolute_actions_on_request(calvin, tmp_path):
     dataset = load(convert.convert(options(calvin, tmp_path / "out", action="abs")))
-    source = calvin.frames[100]
-    np.testing.assert_array_equal(dataset[0]["action"], source["actions"].astype(np.float32))
-    np.testing.assert_array_equal(dataset[0]["calvin.rel_actions"], source["rel_actions"].astype(np.float32))
+    rolls = []
+    for index in range(dataset.num_frames):
+        item = dataset[index]
+        source, action = calvin.frames[item["calvin.frame"].item()], item["action"].numpy().copy()
+        np.testing.assert_array_equal(item["calvin.rel_actions"], source["rel_actions"].astype(np.float32))
+        rolls.append([source["actions"][3], action[3]])
+        action[3] = source["actions"][3]
+        np.testing.assert_array_equal(action, source["actions"].astype(np.float32))
+    recorded, stored = np.array(rolls).T
+    assert np.ptp(recorded) > 6  # the recording jumps, the dataset does not
+    assert np.abs(stored - np.pi).max() < 0.1
+    np.testing.assert_allclose(np.exp(1j * stored), np.exp(1j * recorded), atol=1e-6)
     assert dataset.meta.features["action"]["names"] == ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+
+
+def test_the_commanded_task_is_told_in_the_state_on_request(calvin, tmp_path):
+    dataset = load(convert.convert(options(calvin, tmp_path / "out", mode="play", task_in_state=True)))
+    feature = dataset.meta.features["observation.environment_state"]
+    assert feature["shape"] == (58,)
+    assert feature["names"][24:] == [f"task_{task}" for task in TASKS]
+    for index in range(dataset.num_frames):
+        item = dataset[index]
+        state = item["observation.environment_state"].numpy()
+        expected = np.zeros(34)
+        window = item["calvin.window"].item()
+        if window >= 0:
+            expected[TASKS.index(calvin.windows[window][2])] = 1
+        np.testing.assert_array_equal(state[24:], expected)
+        scene = calvin.frames[item["calvin.frame"].item()]["scene_obs"].astype(np.float32)
+        np.testing.assert_array_equal(state[:24], scene)
+    assert "1 for the commanded task" in (tmp_path / "out" / "README.md").read_text()
+    with pytest.raises(ValueError, match="another conversion"):
+        convert.convert(options(calvin, tmp_path / "out", mode="play"))
+
+
+def test_a_task_that_calvin_does_not_know_cannot_be_told_in_the_state(tmp_path):
+    calvin = write_calvin(tmp_path / "calvin")
+    index = calvin.root / "training/lang_annotations/auto_lang_ann.npy"
+    annotations = np.load(index, allow_pickle=True).item()
+    annotations["language"]["task"][0] = "juggle"
+    np.save(index, annotations)
+    with pytest.raises(ValueError, match="--task_in_state=true: juggle is none"):
+        convert.convert(options(calvin, tmp_path / "out", task_in_state=True))
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_manifest_and_the_card_say_where_the_data_come_from(calvin, tmp_path):

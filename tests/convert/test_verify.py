@@ -22,10 +22,16 @@ from dataset_convert.verify import Mismatch, VerifyConfig
     ("options", "episodes", "frames", "videos", "exact"),
     [
         ({"images": "none"}, 4, 48, 0, 0),
-        ({"images": "none", "action": "abs", "dedup": "frames", "workers": 2}, 2, 24, 0, 0),
+        (
+            {"images": "none", "action": "abs", "dedup": "frames", "task_in_state": True, "workers": 2},
+            2,
+            24,
+            0,
+            0,
+        ),
         ({"images": "png", "tactile": True}, 4, 48, 0, 6),
         ({"images": "video", "depth": True, "tactile": True}, 4, 48, 6, 2),
-        ({"images": "video", "mode": "play"}, 1, 39, 2, 0),
+        ({"images": "video", "mode": "play", "task_in_state": True}, 1, 39, 2, 0),
     ],
     ids=["numbers", "two workers", "png and touch", "video, depth and touch", "play"],
 )

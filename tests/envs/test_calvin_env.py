@@ -12,7 +12,7 @@ import lerobot_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.demos.motion import Motion
 from lerobot_lansar.demos.moves import View
 from lerobot_lansar.demos.skills import SKILLS
-from lerobot_lansar.desk import DeskError
+from lerobot_lansar.desk import TASKS, DeskError
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.benchmark import load_chains
 
@@ -22,7 +22,7 @@ NOTHING = np.array([0, 0, 0, 0, 0, 0, 1.0])
 def script(env, obs, tasks, seed=0):
     """Carries out ``tasks`` one after the other with the demonstrator's skills; yields what each step returned."""
     for task in tasks:
-        state = obs["agent_pos"], obs["environment_state"]
+        state = obs["agent_pos"], obs["environment_state"][:24]
         view = View(env.unwrapped._desk.scene, *state, np.random.default_rng(seed))
         motion = Motion(view.robot_obs, 1.0)
         for waypoint in SKILLS[task](view):
@@ -32,7 +32,7 @@ def script(env, obs, tasks, seed=0):
                     break
                 result = env.step(motion.toward(waypoint, view.robot_obs))
                 obs = result[0]
-                view.robot_obs, view.scene_obs = obs["agent_pos"], obs["environment_state"]
+                view.robot_obs, view.scene_obs = obs["agent_pos"], obs["environment_state"][:24]
                 yield result
                 if result[1] or result[2]:
                     break
@@ -67,17 +67,23 @@ def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_pat
     chain, tasks = next(
         (k, chain.tasks) for k, chain in enumerate(load_chains()) if set(chain.tasks[:2]) <= set(SKILLS)
     )
-    env = CalvinEnv(control_mode="abs", cameras=(), steps_per_command=200, results_dir=str(tmp_path))
+    env = CalvinEnv(
+        control_mode="abs", cameras=(), steps_per_command=200, results_dir=str(tmp_path), task_in_state=True
+    )
     obs, info = env.reset(seed=chain)
-    sentences, rewards = [env.task_description], []
+    sentences, rewards, told = [env.task_description], [], [obs["environment_state"][24:]]
     for result in script(env, obs, tasks[:2]):
         rewards.append(result[1])
         sentences.append(env.task_description)
+        told.append(result[0]["environment_state"][24:])
         assert not result[3]
     obs, _, terminated, _, info = result
     assert sum(rewards) == 2
     assert info == {"is_success": False, "successes": 2}
     assert list(dict.fromkeys(sentences)) == [env._sentences[task][0] for task in tasks[:3]]
+    assert (np.sum(told, axis=1) == 1).all()
+    named = [list(TASKS)[number] for number in np.argmax(told, axis=1)]
+    assert [env._sentences[task][0] for task in named] == sentences
     steps = 0
     while not terminated:
         stay = np.concatenate([obs["agent_pos"][:6], [1]])

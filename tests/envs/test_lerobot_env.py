@@ -24,6 +24,8 @@ def test_features_follow_the_cameras():
         "observation.environment_state": (24,),
         "observation.images.gripper": (3, 84, 84),
     }
+    told = env_to_policy_features(CalvinEnvConfig(task_in_state=True))
+    assert told["observation.environment_state"].shape == (58,)
     with pytest.raises(DeskError, match=r"--env\.cameras: 'wrist'"):
         CalvinEnvConfig(cameras=["wrist"])
 
