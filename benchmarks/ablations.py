@@ -55,7 +55,8 @@ THESIS = [
     "--policy.window_start=episode",
     "--batch_size=24",
 ]
-"""Every choice of configs/thesis/baseline.yaml that is not a size, and as many steps an update; without pictures."""
+"""Every choice of configs/thesis/baseline.yaml that is neither a size nor the optimizer's, as many steps an update; no
+pictures, since there is no trained CLIP here."""
 VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "recommended": ([], []),
     "thesis (No Image) at this size": (THESIS, THESIS_RULES),
@@ -71,6 +72,7 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "windows from anywhere": (["--policy.window_start=anywhere"], []),
     "contrastive loss, weight 0.1": (["--policy.contrastive_weight=0.1"], []),
     "noise on the state, 3 mm and 3 mrad": (["--policy.state_noise=0.003"], []),
+    "paraphrases": (["--policy.paraphrases=true"], []),
     "averaged weights, decay 0.998": (["--policy.ema_decay=0.998"], []),
     "window slides by 1": ([], ["--policy.window_slide=1"]),
     "windows of 64 steps, 24 a batch": (
@@ -176,7 +178,12 @@ def main() -> None:
     runs = [(variant, seed) for seed in options.seeds for variant in options.variants]
     with ThreadPoolExecutor(options.workers) as pool:
         done = list(tqdm(pool.map(lambda run: measure(options, *run), runs), total=len(runs), unit="run"))
-    (options.output_dir / "results.json").write_text(json.dumps(done, indent=1) + "\n")
+    results = options.output_dir / "results.json"
+    with FileLock(f"{results}.lock"):  # of all runs so far
+        before = json.loads(results.read_text()) if results.exists() else []
+        new = {(run["variant"], run["seed"]) for run in done}
+        kept = [run for run in before if (run["variant"], run["seed"]) not in new]
+        results.write_text(json.dumps(kept + done, indent=1) + "\n")
     print("| variant | average length | 1 | 2 | 3 | 4 | 5 | per command |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for variant in options.variants:

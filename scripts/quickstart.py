@@ -18,7 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 BIN = Path(sys.executable).parent
 DATA = Path("data/quickstart")
 OUT = Path("outputs/quickstart")
-CONFIG = "configs/quickstart.yaml"
+CONFIG = "configs/lansar.yaml"
+UPDATES = 3000
 COMMANDS = "scripts/commands.yaml"
 TASKS = [
     "open_drawer",
@@ -99,13 +100,23 @@ def record_and_convert() -> None:
 
 
 def train(name: str, *options: str, log: Path | None = None) -> Path:
-    """Trains with the quickstart's config file; returns the checkpoint."""
+    """Trains the recommended preset with a CLIP that needs no download; returns the checkpoint."""
     checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
     if not checkpoint.exists():
         shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses a folder that an interrupted run left
         shutil.rmtree(OUT / f"eval_{name}", ignore_errors=True)  # of an earlier checkpoint
-        output_dir = f"--output_dir={OUT / name}"
-        run(f"train ({name})", "lerobot-train", f"--config_path={CONFIG}", output_dir, *options, log=log)
+        run(
+            f"train ({name})",
+            "lerobot-train",
+            f"--config_path={CONFIG}",
+            "--dataset.repo_id=lansar/quickstart",
+            f"--dataset.root={DATA / 'lerobot'}",
+            "--policy.clip.model=lansar-tiny",
+            "--policy.clip.pretrained=",
+            f"--output_dir={OUT / name}",
+            *options,
+            log=log,
+        )
     return checkpoint
 
 
@@ -172,7 +183,7 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(1) as other_core:  # training uses one core; the comparison runs beside it
         comparison = other_core.submit(untrained)
-        trained = evaluate("trained", train("trained"))
+        trained = evaluate("trained", train("trained", f"--steps={UPDATES}", f"--save_freq={UPDATES}"))
         compared = comparison.result()
     tasks = success(trained)
     summary = {

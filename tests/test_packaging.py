@@ -58,13 +58,3 @@ def test_every_file_that_the_documentation_names_exists():
     }
     assert len(named) > 10
     assert [entry for entry in sorted(named) if not (ROOT / entry[1]).exists()] == []
-
-
-def test_the_small_preset_is_the_policy_of_the_quickstart():
-    import yaml
-
-    small, quickstart = (
-        yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text())["policy"]
-        for name in ("lansar_small", "quickstart")
-    )
-    assert small == quickstart

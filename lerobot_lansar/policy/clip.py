@@ -138,6 +138,12 @@ class Clip:
             digest.update(value.cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
+    def to(self, device: str | torch.device) -> None:
+        """Moves everything to another device."""
+        self.device = torch.device(device)
+        self.model.to(device)
+        self._mean, self._std = self._mean.to(device), self._std.to(device)
+
     @torch.no_grad()
     def encode_images(self, images: Tensor | np.ndarray) -> Tensor:
         """Pictures to embeddings.

@@ -55,7 +55,8 @@ def dataset_fingerprint(root: Path) -> str:
     """Identifies the contents of a dataset's frame tables, the same wherever the dataset lies.
 
     Of each parquet file it reads name, size and the last 64 KiB: that is where parquet keeps row counts, the
-    sizes of all column chunks and their smallest and largest values, so rewritten frames show, at once.
+    sizes of all column chunks and their smallest and largest values, so rewritten frames show, at once, unless they
+    keep all of these to the byte.
 
     Args:
         root: the LeRobotDataset's folder.
@@ -185,13 +186,13 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
     return arrays, info
 
 
-def load_paraphrases(root: Path) -> dict[str, list[str]]:
-    """For each of the dataset's sentences, all of its sentences for the same CALVIN task, itself included.
+def load_sentences(root: Path) -> dict[str, set[int]]:
+    """Which CALVIN tasks each of the dataset's sentences asks for; none where the frames do not say.
 
     They come from the frames' own columns, so that datasets edited or merged by LeRobot's tools have them too.
 
     Raises:
-        ValueError: the dataset does not say which task its frames show.
+        ValueError: the dataset has no such column.
     """
     pairs: set[tuple[int, int]] = set()
     for path in data_files(root):
@@ -205,14 +206,20 @@ def load_paraphrases(root: Path) -> dict[str, list[str]]:
         )
         pairs.update(tuple(row.values()) for row in columns.aggregate([]).to_pylist())
     sentences = load_tasks(Path(root)).reset_index().set_index("task_index")["task"]
-    by_task: dict[int, set[str]] = {}
-    by_sentence: dict[str, set[int]] = {}
+    asked: dict[str, set[int]] = {}
     for index, task in sorted(pairs):
-        if task >= 0:
-            by_task.setdefault(task, set()).add(sentences[index])
-            by_sentence.setdefault(sentences[index], set()).add(task)
-    # a sentence that names two tasks keeps to sentences that do so too
+        asked.setdefault(sentences[index], set()).update({task} - {-1})
+    return asked
+
+
+def paraphrases(asked: dict[str, set[int]]) -> dict[str, list[str]]:
+    """For each sentence the sentences that ask for its task, itself included; one that names two tasks keeps to
+    sentences that do so too, and one that names none to itself.
+
+    Args:
+        asked: from `load_sentences`.
+    """
     return {
-        sentence: sorted(set.intersection(*(by_task[task] for task in tasks)))
-        for sentence, tasks in by_sentence.items()
+        sentence: sorted(other for other in asked if tasks <= asked[other]) if tasks else [sentence]
+        for sentence, tasks in asked.items()
     }

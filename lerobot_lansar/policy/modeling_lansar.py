@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
@@ -94,10 +95,11 @@ class LanSARPolicy(PreTrainedPolicy):
             self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
             self.averaged.requires_grad_(False)
         if dataset_meta is not None:
+            self._check_target()
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
                 logging.warning(
                     "LanSAR does not read this dataset's videos, but LeRobot decodes them for every sample: "
-                    "train on a copy without them (lansar-convert --videos=false)."
+                    "train on a copy without them (lansar-convert --images=none, then lansar-embed)."
                 )
             windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
             self.scaler.fit(
@@ -107,6 +109,18 @@ class LanSARPolicy(PreTrainedPolicy):
             )
             set_current(windows)
         self.reset()
+
+    def _check_target(self) -> None:
+        """Weights that go on being trained keep their scaling of the targets, so these must stay what they were."""
+        if not self.config.pretrained_path:
+            return
+        trained = PreTrainedConfig.from_pretrained(self.config.pretrained_path)
+        assert isinstance(trained, LanSARConfig)
+        if trained.target != self.config.target:
+            raise ValueError(
+                f"--policy.target={self.config.target}: {self.config.pretrained_path} was trained with target="
+                f"{trained.target}, for which its weights and scaling are made. Leave the option out, or train anew."
+            )
 
     def get_optim_params(self) -> Any:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -145,6 +159,7 @@ class LanSARPolicy(PreTrainedPolicy):
             noise = self.config.state_noise * torch.randn_like(state)
             noise[..., -1] = 0  # the gripper action stays -1 or +1
             state = state + noise
+            state = torch.cat([state[..., :3], wrap(state[..., 3:6]), state[..., 6:]], dim=-1)
         state, blocks, scene = self.scaler.encode(state, batch[OBS_ENV_STATE])
         static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
         network = self.network if self.training else self.acting

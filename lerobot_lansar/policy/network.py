@@ -465,7 +465,7 @@ class LanSARNetwork(nn.Module):
             rows: (N,) int64, places of the valid steps among the B * n, ascending. The valid steps of a window
                 come first in it. Given as numbers and not as a mask, so that a GPU need not tell how many.
             static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
-            group: (B,) int64, equal for commands that ask for the same task; needed with `contrastive`.
+            group: (B, tasks) float, 1 for the tasks that a command asks for; needed with `contrastive`.
 
         Returns:
             Motion (N, 6) and gripper logits (N,), in the order of `rows`; the contrastive loss, None without
@@ -497,7 +497,7 @@ class LanSARNetwork(nn.Module):
         last step, before command and perception meet. Windows of the same task are not held against it.
 
         Args:
-            group: (B,) tells which commands ask for the same task; projected: (B, h) the commands.
+            group: (B, tasks) 1 for the tasks that a command asks for; projected: (B, h) the commands.
             seen: (N, h) what is perceived at each valid step; rows: (N,) their places; batch: B; n: steps.
         """
         bounds = torch.arange(batch + 1, device=rows.device) * n
@@ -508,6 +508,6 @@ class LanSARNetwork(nn.Module):
         windows = F.normalize(self.window_projection(torch.cat([mean, change], dim=1)), dim=1)
         commands = F.normalize(self.command_projection(projected), dim=1)
         logits = commands @ windows.T / CONTRAST_TEMPERATURE
-        same = (group[:, None] == group).float()
+        same = ((group @ group.T > 0) | torch.eye(batch, dtype=torch.bool, device=group.device)).float()
         goal = same / same.sum(dim=1, keepdim=True)
         return (F.cross_entropy(logits, goal) + F.cross_entropy(logits.T, goal)) / 2

@@ -12,7 +12,7 @@ After it a batch has, with n steps in training and without that axis in evaluati
     observation.state (B, n, 15), observation.environment_state (B, n, 24), action (B, n, 7), valid_steps (N,)
     in training: places of the steps that are no padding among the B * n, observation.clip.command (B, D),
     observation.clip.static (B, n, D), observation.clip.gripper (B, n, D), task [B], and for the contrastive loss
-    command_group (B,), equal for commands that ask for the same task
+    command_group (B, tasks), 1 for the tasks that a command asks for
 """
 
 from dataclasses import dataclass, field
@@ -108,8 +108,8 @@ class ClipStep(ProcessorStep):
     _commands: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     _windows: Windows | None = field(default_factory=get_current, init=False, repr=False)
 
-    def clip(self, device: torch.device | str) -> Clip:
-        """The CLIP, built at first use.
+    def clip(self, device: torch.device | str | None = None) -> Clip:
+        """The CLIP, built at first use; moved to `device` if one is named.
 
         Raises:
             ValueError: it is not the one the policy or the dataset's embeddings were made with.
@@ -120,7 +120,7 @@ class ClipStep(ProcessorStep):
                     f"The checkpoint reads CLIP {self.model} embeddings; --policy.clip.model="
                     f"{self._windows.clip.model} cannot be changed when resuming or fine-tuning. Leave it out."
                 )
-            clip = Clip(ClipConfig(self.model, self.pretrained), device, self._weights)
+            clip = Clip(ClipConfig(self.model, self.pretrained), device or "cpu", self._weights)
             made_with = {"policy was trained": self.weights_sha256}
             if self._windows is not None and self._windows.clip_info:
                 made_with["dataset's pictures were embedded"] = self._windows.clip_info["weights_sha256"]
@@ -132,6 +132,9 @@ class ClipStep(ProcessorStep):
                         "Set --policy.clip.pretrained to the weights used then, or convert the dataset again."
                     )
             self._clip, self.weights_sha256, self._weights = clip, clip.weights_sha256, None
+        if device is not None and self._clip.device != torch.device(device):
+            self._clip.to(device)
+            self._commands.clear()
         return self._clip
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
@@ -165,7 +168,7 @@ class ClipStep(ProcessorStep):
         return clip.encode_images(images)
 
     def get_config(self) -> dict[str, Any]:
-        sha256 = self.clip("cpu").weights_sha256
+        sha256 = self.clip().weights_sha256
         return {
             "model": self.model,
             "pretrained": self.pretrained,
@@ -176,7 +179,7 @@ class ClipStep(ProcessorStep):
     def state_dict(self) -> dict[str, Tensor]:
         if weights_are_public(ClipConfig(self.model, self.pretrained)):
             return {}
-        weights = self.clip("cpu").model.state_dict()
+        weights = self.clip().model.state_dict()
         return {name: value.detach().cpu().clone() for name, value in weights.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .frames import load_embeddings, load_frames, load_paraphrases
+from .frames import load_embeddings, load_frames, load_sentences, paraphrases
 
 if TYPE_CHECKING:
     from .configuration_lansar import LanSARConfig
@@ -99,8 +99,8 @@ class Windows:
         embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
         clip_info: clip.json's contents, empty without `use_images`.
         clip: the policy's choice of CLIP.
-        sentences: other words for each command, from `load_paraphrases`; empty unless `paraphrases` or the
-            contrastive loss need them.
+        asked: the CALVIN tasks that each command asks for; empty unless `paraphrases` or the contrastive loss need
+            them.
 
     Raises:
         ValueError, FileNotFoundError: the dataset cannot be used; the message says why and what to do.
@@ -139,9 +139,10 @@ class Windows:
                     "the dataset again."
                 )
         self.paraphrases = config.paraphrases
-        self.sentences = load_paraphrases(root) if config.paraphrases or config.contrastive_weight else {}
-        numbers = {tuple(listed): i for i, listed in enumerate(self.sentences.values())}
-        self._group = {sentence: numbers[tuple(listed)] for sentence, listed in self.sentences.items()}
+        self.asked = load_sentences(root) if config.paraphrases or config.contrastive_weight else {}
+        self._choices = paraphrases(self.asked)
+        named = sorted(set[int]().union(*self.asked.values()))
+        self._names = {s: [float(task in tasks) for task in named] for s, tasks in self.asked.items()}
         self.device = torch.device(config.device or "cpu")
         self._move_to_gpu()
 
@@ -199,15 +200,15 @@ class Windows:
         """
         if not self.paraphrases or not torch.is_grad_enabled():
             return tasks
-        choices = [self.sentences.get(task, [task]) for task in tasks]
+        choices = [self._choices.get(task, [task]) for task in tasks]
         draws = torch.rand(len(choices)).tolist()
         return [listed[int(draw * len(listed))] for listed, draw in zip(choices, draws, strict=True)]
 
     def groups(self, tasks: list[str]) -> Tensor | None:
-        """(B,) int64, equal for commands with the same paraphrases; None where nothing asks for it."""
-        if not self.sentences:
+        """(B, tasks) float32, 1 for the CALVIN tasks that each command asks for; None where nothing needs it."""
+        if not self.asked:
             return None
-        return torch.tensor([self._group.get(task, -1) for task in tasks])
+        return torch.tensor([self._names[task] for task in tasks])
 
     def _move_to_gpu(self) -> None:
         """The arrays onto the GPU if they take at most half of what is free there: lookups then cost no transfer."""

@@ -5,7 +5,7 @@
 Runs one episode with LeRobot's own rollout and writes into ``--output_dir``:
 
     context_attention.png   how much each modality is attended to in the context encoder at every step, above it frames
-    decoder_attention.png   what the decoder attends to when it decides at the steps of ``--decoder_steps``
+    decoder_attention.png   what the decoder attends to when it decides at the steps of ``--decoder_steps``, under their frames
     rollout.mp4             the static camera
     attention.npz           the weights themselves, see `save`
 """
@@ -28,6 +28,7 @@ from lerobot.utils.io_utils import write_video
 from lerobot.utils.random_utils import set_seed
 
 from ..desk.errors import DeskError
+from ..envs.configuration_calvin import CalvinEnvConfig
 from ..policy.modeling_lansar import LanSARPolicy
 from ..policy.network import recorded_attention
 from .plots import plot_context_attention, plot_decoder_attention
@@ -101,6 +102,8 @@ def observe(config: AttentionConfig) -> Attention:
     if any(step < 0 for step in config.decoder_steps):
         raise ValueError(f"--decoder_steps={config.decoder_steps}: control steps are counted from 0")
     set_seed(config.seed)
+    if isinstance(config.env, CalvinEnvConfig):
+        config.env.control_mode = config.policy.control_mode  # there is only one that fits
     envs = make_env(config.env, n_envs=1)
     env = next(iter(next(iter(envs.values())).values()))
     policy = make_policy(config.policy, env_cfg=config.env).eval()

@@ -65,13 +65,18 @@ def plot_context_attention(attention: "Attention", path: Path) -> None:
 
 
 def plot_decoder_attention(attention: "Attention", steps: list[int], path: Path) -> None:
-    """Heat maps: from the newest step to the window's tokens, per decoder layer, mean over heads (Figure 6.1)."""
+    """Heat maps: from the newest step to the window's tokens, per decoder layer, mean over heads (Figure 6.1); above
+    them the static camera's picture of that step.
+    """
     steps = [step for step in steps if step < len(attention.decoder)] or [len(attention.decoder) - 1]
     figure, grid = plt.subplots(
-        2, len(steps), figsize=(1 + 5.5 * len(steps), 6), squeeze=False, layout="constrained"
+        3, len(steps), figsize=(1 + 5.5 * len(steps), 8), squeeze=False, layout="constrained"
     )
     for column, step in enumerate(steps):
-        for axes, (kind, other) in zip(grid[:, column], (("self", "X"), ("cross", "E")), strict=True):
+        grid[0, column].imshow(attention.frames[step])
+        grid[0, column].set_title(f"step {step}: “{attention.commands[step]}”", fontsize=9)
+        grid[0, column].axis("off")
+        for axes, (kind, other) in zip(grid[1:, column], (("self", "X"), ("cross", "E")), strict=True):
             weights = attention.decoder[step][kind].mean(axis=1)  # (layers, tokens)
             count = weights.shape[1]
             if attention.prepended:
@@ -83,7 +88,7 @@ def plot_decoder_attention(attention: "Attention", steps: list[int], path: Path)
             labelled = range(count) if count <= 16 else range(1, count, 2 * (count // 32 + 1))
             axes.set(
                 xticks=labelled, xticklabels=[names[i] for i in labelled], yticks=range(len(weights)),
-                ylabel="layer", title=f"step {step}, {kind}-attention",
+                ylabel="layer", title=f"{kind}-attention",
             )  # fmt: skip
             axes.tick_params(axis="x", labelrotation=90, labelsize=7)
             figure.colorbar(image, ax=axes)

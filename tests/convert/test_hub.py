@@ -138,7 +138,7 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
 
     # another machine: an empty cache
     code, printed = run(
-        "lerobot-train", f"--config_path={REPOSITORY / 'configs/lansar_small.yaml'}", "--dataset.repo_id=me/desk",
+        "lerobot-train", f"--config_path={REPOSITORY / 'configs/lansar.yaml'}", "--dataset.repo_id=me/desk",
         "--steps=2", "--batch_size=4", "--save_freq=2", f"--output_dir={tmp_path / 'train'}",
         "--policy.use_images=true", "--policy.clip.model=lansar-tiny", "--policy.clip.pretrained=",
         "--policy.device=cpu", home="elsewhere",

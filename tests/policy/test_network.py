@@ -10,6 +10,7 @@ from torch import nn
 from lerobot_lansar.policy.network import (
     Attention,
     BatchNorm,
+    DecoderCache,
     DecoderLayer,
     EncoderLayer,
     LanSARNetwork,
@@ -27,6 +28,10 @@ TINY = NetworkConfig(
     feedforward=32,
     window=8,
 )
+
+
+THESIS = NetworkConfig()
+at_both_sizes = pytest.mark.parametrize("size", [TINY, THESIS], ids=["tiny", "thesis"])
 
 
 def windows(config, lengths, seed=0):
@@ -48,9 +53,9 @@ def windows(config, lengths, seed=0):
     }
 
 
-def build(**options):
+def build(size=TINY, **options):
     torch.manual_seed(0)
-    return LanSARNetwork(replace(TINY, **options))
+    return LanSARNetwork(replace(size, **options))
 
 
 def gradient_reaches(network, name):
@@ -92,17 +97,23 @@ def test_layers_compute_what_pytorchs_transformer_layers_compute():
     torch.testing.assert_close(decoder(x, memory), expected, rtol=1e-4, atol=1e-5)
 
 
+@torch.no_grad()
 @pytest.mark.parametrize("prepended", [False, True])
-def test_a_step_is_not_changed_by_what_comes_after_it(prepended):
-    network = build(command_prepended=prepended).eval()
-    inputs = windows(TINY, [6])
-    before = network(**inputs)[0]
-    for name in ("state", "blocks", "scene", "static", "gripper"):
-        inputs[name] = inputs[name].clone()
-        inputs[name][:, 4:] += 100
-    after = network(**inputs)[0]
-    assert torch.equal(before[:4], after[:4])
-    assert not torch.allclose(before[4], after[4])
+@at_both_sizes
+def test_a_step_is_not_changed_by_what_comes_after_it(size, prepended):
+    network = build(size, command_prepended=prepended).eval()
+    inputs = windows(size, [size.window])
+    motion, logit, _ = network(**inputs)
+    assert (motion.shape, logit.shape) == ((size.window, 6), (size.window,))
+    for step in (1, size.window // 2, size.window - 1):
+        changed = {name: value.clone() for name, value in inputs.items()}
+        for name in ("state", "blocks", "scene", "static", "gripper"):
+            changed[name][:, step:] += 10
+        other_motion, other_logit, _ = network(**changed)
+        assert torch.equal(motion[:step], other_motion[:step])
+        assert torch.equal(logit[:step], other_logit[:step])
+        assert not torch.allclose(motion[step], other_motion[step])
+        assert not torch.allclose(logit[step], other_logit[step])
 
 
 def test_every_earlier_step_is_seen():
@@ -113,10 +124,12 @@ def test_every_earlier_step_is_seen():
     assert (inputs["state"].grad[0].abs().sum(dim=1) > 0).all()
 
 
+@torch.no_grad()
 @pytest.mark.parametrize("norm", ["batch", "layer"])
-def test_padding_changes_nothing_in_training_mode_either(norm):
-    network = build(mlp_norm=norm, dropout=0.0).train()
-    inputs = windows(TINY, [6, 3])
+@at_both_sizes
+def test_padding_changes_nothing_in_training_mode_either(size, norm):
+    network = build(size, mlp_norm=norm, dropout=0.0).train()
+    inputs = windows(size, [6, 3])
     motion, logit, _ = network(**inputs)
     wild = {name: value.clone() for name, value in inputs.items()}
     for name in ("state", "blocks", "scene", "static", "gripper"):
@@ -145,9 +158,10 @@ def test_encoding_and_decoding_step_by_step_is_the_same_as_the_window_at_once():
     torch.testing.assert_close(motion, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_dropped_modalities_have_no_token_no_parameter_and_no_influence():
-    full, no_images = build(), build(use_images=False)
-    no_spatial = build(use_spatial_context=False)
+@at_both_sizes
+def test_dropped_modalities_have_no_token_no_parameter_and_no_influence(size):
+    full, no_images = build(size), build(size, use_images=False)
+    no_spatial = build(size, use_spatial_context=False)
     assert full.context_tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S", "I", "G"]
     assert no_images.context_tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S"]
     assert no_spatial.context_tokens == ["CLS", "I", "G"]
@@ -156,7 +170,9 @@ def test_dropped_modalities_have_no_token_no_parameter_and_no_influence():
         assert gradient_reaches(no_images, name) == (name not in ("static", "gripper"))
         assert gradient_reaches(no_spatial, name) == (name not in ("blocks", "scene"))  # the target keeps X
     assert not [name for name, _ in no_images.named_parameters() if "static" in name or "gripper_c" in name]
-    assert not [name for name, _ in no_spatial.named_parameters() if "block" in name or "scene" in name]
+    dropped = ("block_context", "scene_context", "state_context")
+    assert not [name for name, _ in no_spatial.named_parameters() if name.startswith(dropped)]
+    assert [name for name, _ in no_spatial.named_parameters() if name.startswith("state_target")]
 
 
 def test_a_context_sees_the_command_only_when_asked_to():
@@ -212,7 +228,7 @@ def test_the_thesis_size_has_the_parameters_table_4_2_implies():
     expected += h + 8 * h + 2 * 128 * h  # CLS, modality positions, memory and target positions
     network = LanSARNetwork(NetworkConfig())
     assert sum(p.numel() for p in network.parameters()) == expected
-    assert 40e6 < expected < 60e6
+    assert expected == 46_811_811  # docs/lansar.md
 
 
 def test_weights_start_xavier_uniform_and_biases_zero():
@@ -253,18 +269,23 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
     assert (weights.triu(1) == 0).all()
 
     attention = network.decoder_layers[0].self_attention
-    x = torch.randn(1, 6, TINY.hidden)
+    x, memory = torch.randn(2, 1, 6, TINY.hidden)
+    cache = DecoderCache(network.config, 1, x)
+    for decoded in (slice(0, 4), slice(4, 6)):  # of the cache: four tokens, then two that see these
+        past = cache.add([0], (decoded.stop - decoded.start) // 2)
+        attention.weights = []
+        out = attention(x[:, decoded], memory[:, decoded], past=past)
+        values = attention.value(memory[:, : decoded.stop]).unflatten(-1, (2, -1)).transpose(1, 2)
+        mixed = (attention.weights[0] @ values).transpose(1, 2).flatten(2)
+        torch.testing.assert_close(attention.out(mixed), out)
     attention.weights = []
-    out = attention(x, x, causal=True)
-    values = attention.value(x).unflatten(-1, (2, -1)).transpose(1, 2)
-    mixed = (attention.weights[0] @ values).transpose(1, 2).flatten(2)
-    torch.testing.assert_close(attention.out(mixed), out)
+    torch.testing.assert_close(attention(x, memory, causal=True)[:, decoded], out)
 
 
 def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
     network = build(contrastive=True).eval()
     inputs = windows(TINY, [4, 6, 3, 5])
-    inputs["group"] = torch.tensor([0, 1, 2, 0])  # two windows of one task
+    inputs["group"] = torch.eye(3)[[0, 1, 2, 0]]  # two windows of one task
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     losses = []
     for _ in range(60):
@@ -279,10 +300,41 @@ def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
     assert build()(**windows(TINY, [4]))[2] is None
 
 
+def test_the_contrastive_loss_holds_no_two_commands_apart_that_share_a_task():
+    network = build(contrastive=True).eval()
+    inputs = windows(TINY, [4, 6, 5])
+    inputs["group"] = torch.tensor([[1.0, 0], [1, 1], [0, 0]])  # red, "lift it", none
+    logits = []
+    cross_entropy = torch.nn.functional.cross_entropy
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            torch.nn.functional,
+            "cross_entropy",
+            lambda x, goal: logits.append(goal) or cross_entropy(x, goal),
+        )
+        network(**inputs)
+    for goal in logits:
+        assert goal.tolist() == [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]]
+
+
+def test_nothing_in_training_waits_for_a_gpu_to_tell_a_number():
+    """PyTorch's fake tensors have no values: what asks for one (an item, a mask's count) raises."""
+    from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
+
+    with FakeTensorMode():
+        network = build(contrastive=True, command_in_context=True).train()
+        inputs = windows(TINY, [6, 3]) | {"group": torch.ones(2, 4)}
+        motion, logit, contrast = network(**inputs)
+        (motion.sum() + logit.sum() + contrast).backward()
+        assert motion.shape == (9, 6)
+        with pytest.raises(DataDependentOutputException):
+            motion.sum().item()
+
+
 @pytest.mark.parametrize("where", ["padding", "batch"])
 def test_the_contrastive_loss_describes_a_window_by_its_own_steps(where):
     network = build(contrastive=True).eval()
-    inputs = windows(TINY, [4, 6]) | {"group": torch.tensor([0, 1])}
+    inputs = windows(TINY, [4, 6]) | {"group": torch.eye(2)}
     before = network(**inputs)[2]
     other = {name: value.clone() for name, value in inputs.items()}
     if where == "padding":

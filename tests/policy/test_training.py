@@ -4,12 +4,13 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 
 import draccus
 import pytest
 import torch
 import yaml
+from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
@@ -63,6 +64,10 @@ def test_lerobot_train_trains_resumes_fine_tunes_and_measures_a_held_out_loss(tm
     tune += [*data, *quick, "--dataset.episodes=[1,2]", "--steps=1", f"--output_dir={tmp_path / 'tuned'}"]
     result = run([fresh, resume, tune], tmp_path)
     assert result.returncode == 0, result.stderr[-4000:]
+    other = [*tune[:-1], f"--output_dir={tmp_path / 'other'}", "--policy.target=achieved"]
+    refused = run([other], tmp_path)
+    assert refused.returncode != 0
+    assert "was trained with target=commanded" in refused.stderr
     assert "eval_loss=" in result.stderr
     assert "position_loss" in result.stderr
     assert checkpoint.resolve().parent.name == "000004"
@@ -119,6 +124,17 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
     assert not torch.equal(after[f"averaged.module.{weight}"], after[f"network.{weight}"])
 
 
+def test_the_units_that_fsdp_shards_are_the_networks_layers():
+    from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+
+    from .conftest import small_config
+
+    policy = LanSARPolicy(small_config())
+    layers = [*policy.network.context_layers, *policy.network.decoder_layers]
+    found = [module for module in policy.modules() if type(module).__name__ in LanSARPolicy._no_split_modules]
+    assert set(found) == set(layers)
+
+
 def training_config(name):
     """A configuration file's policy and the rest of it."""
     text = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
@@ -146,18 +162,29 @@ def test_shipped_configurations_hold_real_options_only(name):
 
 
 def test_the_thesis_preset_is_the_thesis():
+    written = yaml.safe_load((CONFIGS / "thesis/baseline.yaml").read_text())["policy"]
+    assert written == {
+        "type": "lansar", "push_to_hub": False,
+        # Table 4.2, but for 8 decoder heads
+        "hidden": 512, "context_layers": 6, "context_heads": 16, "decoder_layers": 6, "decoder_heads": 8,
+        "feedforward": 2048, "dropout": 0.1, "window": 64, "learning_rate": 4e-4, "weight_decay": 0.01,
+        "warmup_fraction": 5 / 125,
+        # sections 3 and 4.2
+        "mlp_norm": "batch", "use_images": True, "use_spatial_context": True, "command_prepended": False,
+        "orientation": "euler", "target": "achieved", "window_start": "episode", "smooth_l1_beta": 0.1,
+        # section 4.3.1
+        "control_mode": "abs", "history_clear_steps": 120, "window_slide": 1,
+        "position_scale_start": 3.0, "position_scale_slope": 1.0, "yaw_scale": 1.5,
+        "clip": {"model": "ViT-B-32", "pretrained": "openai"},
+        # what the thesis does not have
+        "command_in_context": False, "egocentric_blocks": False, "paraphrases": False, "state_noise": 0.0,
+        "contrastive_weight": 0.0, "ema_decay": 0.0, "dtype": "float32",
+    }  # fmt: skip
     config, rest = training_config("thesis/baseline")
-    assert (config.hidden, config.context_heads, config.decoder_heads, config.feedforward) == (
-        512,
-        16,
-        8,
-        2048,
-    )
-    assert (config.target, config.orientation, config.window_start) == ("achieved", "euler", "episode")
-    assert (config.position_scale_start, config.position_scale_slope, config.yaw_scale) == (3, 1, 1.5)
-    assert (config.window, config.window_slide, config.history_clear_steps) == (64, 1, 120)
-    assert not any((config.command_in_context, config.paraphrases, config.egocentric_blocks))
-    assert (config.contrastive_weight, config.state_noise, config.ema_decay) == (0, 0, 0)
+    options = {option.name for option in fields(config)} - {
+        option.name for option in fields(PreTrainedConfig)
+    }
+    assert options <= written.keys()  # a new option must be decided here too
     assert round(config.warmup_fraction * rest["steps"]) == 1200
     assert rest["batch_size"] * rest["steps"] == 125 * 240 * 96
     assert rest["eval_steps"] == 25

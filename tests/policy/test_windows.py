@@ -72,16 +72,24 @@ def test_a_batch_of_windows_is_what_a_plain_loop_gives(form, target, relative, a
     assert batch["state"].shape[1] == 64
 
 
-def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path):
+def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path, monkeypatch):
     """Without a GPU: the same lookups in tensors on the CPU."""
     make_dataset(tmp_path / "data")
     add_embeddings(tmp_path / "data", Clip(ClipConfig("lansar-tiny", ""), "cpu"))
     windows = make_windows(tmp_path / "data", use_images=True)
     index = np.array([3, 60, 150])
     expected = windows.batch(index)
-    windows.on_gpu = True
-    for arrays in (windows.arrays, windows.embeddings):
-        arrays.update({name: torch.tensor(array) for name, array in arrays.items()})
+    size = sum(array.nbytes for array in (*windows.arrays.values(), *windows.embeddings.values()))
+    tensor = torch.tensor
+    monkeypatch.setattr(torch, "tensor", lambda array, device=None: tensor(array))
+    windows.device = torch.device("cuda")
+    for free in (2 * size - 1, 2 * size):  # they may take half of it
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, free))
+        windows._move_to_gpu()
+        assert windows.on_gpu == (free == 2 * size)
+        assert all(isinstance(array, torch.Tensor) == windows.on_gpu for array in windows.arrays.values())
+    monkeypatch.undo()
+    windows.device = torch.device("cpu")
     found = windows.batch(index)
     assert found.keys() == expected.keys()
     for name, value in expected.items():
@@ -257,3 +265,6 @@ def test_paraphrases_say_the_same_task_in_other_words(tmp_path):
     assert set(said[50:100]) == set(lifting)
     assert set(said[100:]) == {"lift it"}  # of two tasks: only what fits both
     assert make_windows(root).say(["anything"]) == ["anything"]
+    together = windows.groups(["pull the drawer", "lift it", "lift the red block", "play"])
+    shares_a_task = together @ together.T > 0
+    assert shares_a_task.tolist() == [[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]

@@ -41,7 +41,7 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
     monkeypatch.setattr(attention_module, "observe", lambda config: seen.append(observe(config)) or seen[-1])
     run(
         monkeypatch, f"--policy.path={checkpoint}", "--env.type=calvin", "--env.task=open_drawer",
-        "--env.control_mode=abs", "--env.cameras=[]", "--env.steps_per_command=20", "--seed=3",
+        "--env.cameras=[]", "--env.steps_per_command=20", "--seed=3",
         "--decoder_steps=[0,10,99]", f"--output_dir={tmp_path / 'out'}",
     )  # fmt: skip
     (attention,) = seen
