@@ -5,7 +5,7 @@
 Runs one episode with LeRobot's own rollout and writes into ``--output_dir``:
 
     context_attention.png   how much each modality is attended to in the context encoder at every step, above it frames
-    decoder_attention.png   what the decoder attends to when it decides at the steps of ``--decoder_steps``, below frames
+    decoder_attention.png   what the decoder attends to at the steps of ``--decoder_steps``, below their frames
     rollout.mp4             the static camera
     attention.npz           the weights themselves, see `save`
 """

@@ -249,6 +249,7 @@ def test_a_single_row_passes_batch_norm_in_training():
     assert motion.shape == (1, 6)
 
 
+@torch.no_grad()
 def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise():
     network = build().eval()
     inputs = windows(TINY, [5])
