@@ -201,6 +201,12 @@ def _clip(clip: dict[str, Any] | None) -> str:
 
 
 def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
+    if request.get("task_in_state"):  # for policies that read no language; LanSAR refuses it
+        cameras = " --env.cameras='[]'" if request["images"] == "none" else ""
+        return f"""    lerobot-train --policy.type=act --policy.push_to_hub=false \\
+        --dataset.repo_id={repo_id} --output_dir=outputs/train
+    lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
+        --env.control_mode={request["action"]} --env.task_in_state=true{cameras}"""
     train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
     if clip is not None:
         train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"

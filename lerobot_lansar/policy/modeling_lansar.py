@@ -99,7 +99,8 @@ class LanSARPolicy(PreTrainedPolicy):
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
                 logging.warning(
                     "LanSAR does not read this dataset's videos, but LeRobot decodes them for every sample: "
-                    "train on a copy without them (lansar-convert --images=none, then lansar-embed)."
+                    "train on a copy without them (lansar-convert --images=none, with "
+                    "--embed=true for a policy that looks at pictures)."
                 )
             windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
             self.scaler.fit(

@@ -141,8 +141,8 @@ class Windows:
         self.paraphrases = config.paraphrases
         self.asked = load_sentences(root) if config.paraphrases or config.contrastive_weight else {}
         self._choices = paraphrases(self.asked)
-        named = sorted(set[int]().union(*self.asked.values()))
-        self._names = {s: [float(task in tasks) for task in named] for s, tasks in self.asked.items()}
+        known = sorted(set[int]().union(*self.asked.values()))
+        self._names = {s: [float(task in tasks) for task in known] for s, tasks in self.asked.items()}
         self.device = torch.device(config.device or "cpu")
         self._move_to_gpu()
 

@@ -88,7 +88,11 @@ def test_the_commanded_task_is_told_in_the_state_on_request(calvin, tmp_path):
         np.testing.assert_array_equal(state[24:], expected)
         scene = calvin.frames[item["calvin.frame"].item()]["scene_obs"].astype(np.float32)
         np.testing.assert_array_equal(state[:24], scene)
-    assert "1 for the commanded task" in (tmp_path / "out" / "README.md").read_text()
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "1 for the commanded task" in card
+    assert "--policy.type=act" in card
+    assert "--env.task_in_state=true" in card
+    assert "--policy.type=lansar" not in card
     with pytest.raises(ValueError, match="another conversion"):
         convert.convert(options(calvin, tmp_path / "out", mode="play"))
 

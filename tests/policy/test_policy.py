@@ -326,6 +326,18 @@ def test_embeddings_made_with_other_clip_weights_are_refused(tmp_path):
         ClipStep("lansar-tiny", "", weights_sha256="e" * 64).clip("cpu")
 
 
+def test_clip_follows_the_observations_to_their_device():
+    from lerobot_lansar.policy.processor_lansar import ClipStep
+
+    clip_step = ClipStep("lansar-tiny", "")
+    clip_step._windows = None  # of another test's policy
+    clip_step.get_config()  # saved before its first use, on the CPU
+    clip_step._commands["go"] = torch.zeros(1)
+    clip = clip_step.clip("meta")  # a device that every machine has
+    assert {value.device.type for value in (*clip.model.parameters(), clip._mean)} == {"meta"}
+    assert not clip_step._commands
+
+
 def test_clip_embeds_both_image_layouts_alike_and_tells_commands_apart():
     clip = Clip(ClipConfig("lansar-tiny", ""))
     images = np.random.default_rng(0).integers(0, 256, (2, 84, 84, 3), dtype=np.uint8)
