@@ -9,7 +9,7 @@ r"""Which of LanSAR's options earn their place: same demonstrations and updates,
 
 Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
 desk, both with the sentences of scripts/commands.yaml. What is in --output_dir is not done again. Prints a Markdown
-table; --output_dir/results.json holds every run.
+table and writes what it is made of to --output_dir/results.json.
 """
 
 import hashlib
@@ -42,8 +42,8 @@ THESIS_RULES = [
     "--policy.position_scale_start=3",
     "--policy.position_scale_slope=1",
     "--policy.yaw_scale=1.5",
-    "--policy.window_slide=1",
 ]
+SLIDE = ["--policy.window_slide=1"]
 THESIS = [
     *ACHIEVED,
     "--policy.orientation=euler",
@@ -59,8 +59,11 @@ THESIS = [
 pictures, since there is no trained CLIP here."""
 VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "recommended": ([], []),
-    "thesis (No Image) at this size": (THESIS, THESIS_RULES),
-    "thesis (No Image) at this size, Prepend": ([*THESIS, "--policy.command_prepended=true"], THESIS_RULES),
+    "thesis (No Image) at this size": (THESIS, [*THESIS_RULES, *SLIDE]),
+    "thesis (No Image) at this size, Prepend": (
+        [*THESIS, "--policy.command_prepended=true"],
+        [*THESIS_RULES, *SLIDE],
+    ),
     "achieved targets, thesis constants": (ACHIEVED, THESIS_RULES),
     "achieved targets, as predicted": (ACHIEVED, []),
     "euler angles": (["--policy.orientation=euler"], []),
@@ -74,7 +77,7 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "noise on the state, 3 mm and 3 mrad": (["--policy.state_noise=0.003"], []),
     "paraphrases": (["--policy.paraphrases=true"], []),
     "averaged weights, decay 0.998": (["--policy.ema_decay=0.998"], []),
-    "window slides by 1": ([], ["--policy.window_slide=1"]),
+    "window slides by 1": ([], SLIDE),
     "windows of 64 steps, 24 a batch": (
         ["--policy.window=64", "--policy.window_slide=32", "--batch_size=24"],
         [],
@@ -178,12 +181,8 @@ def main() -> None:
     runs = [(variant, seed) for seed in options.seeds for variant in options.variants]
     with ThreadPoolExecutor(options.workers) as pool:
         done = list(tqdm(pool.map(lambda run: measure(options, *run), runs), total=len(runs), unit="run"))
-    results = options.output_dir / "results.json"
-    with FileLock(f"{results}.lock"):  # of all runs so far
-        before = json.loads(results.read_text()) if results.exists() else []
-        new = {(run["variant"], run["seed"]) for run in done}
-        kept = [run for run in before if (run["variant"], run["seed"]) not in new]
-        results.write_text(json.dumps(kept + done, indent=1) + "\n")
+    settings = {"config": str(options.config), "updates": options.updates, "chains": options.chains}
+    (options.output_dir / "results.json").write_text(json.dumps(settings | {"runs": done}, indent=1) + "\n")
     print("| variant | average length | 1 | 2 | 3 | 4 | 5 | per command |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for variant in options.variants:

@@ -207,6 +207,11 @@ def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str
         --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
         --env.control_mode={request["action"]} --env.task_in_state=true{cameras}"""
+    if request["mode"] == "play":
+        return f"""    lerobot-train --policy.type=… --policy.push_to_hub=false --dataset.repo_id={repo_id} --output_dir=outputs/train
+
+for a policy that reads one frame's command at a time. LanSAR learns demonstrations of one command each and refuses
+this dataset; convert with `--mode=windows` for it."""
     train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
     if clip is not None:
         train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"

@@ -82,13 +82,14 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
         int64: the rows where the frame's episode begins and ends (end exclusive).
 
     Raises:
-        ValueError: a missing column, a wrong width, NaN or infinity, an index that occurs twice.
+        ValueError: a missing column, a wrong width, NaN or infinity, an index that occurs twice, an episode with
+            more than one command.
     """
     parts: dict[str, list[np.ndarray]] = {}
     files = data_files(root)
     for path in tqdm(files, desc="Reading frames", disable=len(files) < 20):
         present = pq.read_schema(path).names
-        wanted = ["index", "episode_index", *(column for column, _ in COLUMNS.values())]
+        wanted = ["index", "episode_index", "task_index", *(column for column, _ in COLUMNS.values())]
         missing = [name for name in wanted if name not in present]
         if missing:
             raise ValueError(
@@ -96,7 +97,7 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
                 "observation.environment_state and action as lansar-convert writes them."
             )
         table = pq.read_table(path, columns=wanted)
-        for name in ("index", "episode_index"):
+        for name in ("index", "episode_index", "task_index"):
             parts.setdefault(name, []).append(table[name].to_numpy())
         for name, (column, width) in COLUMNS.items():
             values = np.concatenate([chunk.flatten().to_numpy() for chunk in table[column].chunks])
@@ -115,8 +116,14 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
     frames = {name: values[order] for name, values in frames.items()}
     if (np.diff(frames["index"]) < 1).any():
         raise ValueError(f"{Path(root) / 'data'} holds a frame index twice: files left over from before?")
-    episode = frames.pop("episode_index")
+    episode, task = frames.pop("episode_index"), frames.pop("task_index")
     starts = np.flatnonzero(np.diff(episode, prepend=episode[0] - 1))
+    changes = np.setdiff1d(np.flatnonzero(np.diff(task)) + 1, starts)
+    if len(changes):
+        raise ValueError(
+            f"{root}: the command changes within episode {episode[changes[0]]} (index {frames['index'][changes[0]]}). "
+            "LanSAR learns demonstrations of one command each: convert with lansar-convert --mode=windows."
+        )
     ends = np.append(starts[1:], len(episode))
     frames["first"] = np.repeat(starts, ends - starts)
     frames["end"] = np.repeat(ends, ends - starts)

@@ -95,7 +95,7 @@ class LanSARPolicy(PreTrainedPolicy):
             self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
             self.averaged.requires_grad_(False)
         if dataset_meta is not None:
-            self._check_target()
+            self._check_pretrained()
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
                 logging.warning(
                     "LanSAR does not read this dataset's videos, but LeRobot decodes them for every sample: "
@@ -111,17 +111,19 @@ class LanSARPolicy(PreTrainedPolicy):
             set_current(windows)
         self.reset()
 
-    def _check_target(self) -> None:
-        """Weights that go on being trained keep their scaling of the targets, so these must stay what they were."""
+    def _check_pretrained(self) -> None:
+        """Weights that go on being trained must mean what they meant; other options change a shape, and fail by that."""
         if not self.config.pretrained_path:
             return
         trained = PreTrainedConfig.from_pretrained(self.config.pretrained_path)
         assert isinstance(trained, LanSARConfig)
-        if trained.target != self.config.target:
-            raise ValueError(
-                f"--policy.target={self.config.target}: {self.config.pretrained_path} was trained with target="
-                f"{trained.target}, for which its weights and scaling are made. Leave the option out, or train anew."
-            )
+        for name in ("target", "mlp_norm", "context_heads", "decoder_heads", "command_prepended"):
+            asked, made_for = getattr(self.config, name), getattr(trained, name)
+            if asked != made_for:
+                raise ValueError(
+                    f"--policy.{name}={asked}: {self.config.pretrained_path} was trained with {name}={made_for}, for "
+                    "which its weights and scaling are made. Leave the option out, or train anew."
+                )
 
     def get_optim_params(self) -> Any:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]

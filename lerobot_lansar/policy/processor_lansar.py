@@ -115,12 +115,14 @@ class ClipStep(ProcessorStep):
             ValueError: it is not the one the policy or the dataset's embeddings were made with.
         """
         if self._clip is None:
-            if self._windows is not None and self._windows.clip.model != self.model:
+            mine = ClipConfig(self.model, self.pretrained)
+            if self._windows is not None and self._windows.clip != mine:
                 raise ValueError(
-                    f"The checkpoint reads CLIP {self.model} embeddings; --policy.clip.model="
-                    f"{self._windows.clip.model} cannot be changed when resuming or fine-tuning. Leave it out."
+                    f"The checkpoint was trained with {mine}; --policy.clip.model={self._windows.clip.model} and "
+                    f"--policy.clip.pretrained={self._windows.clip.pretrained} cannot be changed when resuming or "
+                    "fine-tuning. Leave them out."
                 )
-            clip = Clip(ClipConfig(self.model, self.pretrained), device or "cpu", self._weights)
+            clip = Clip(mine, device or "cpu", self._weights)
             made_with = {"policy was trained": self.weights_sha256}
             if self._windows is not None and self._windows.clip_info:
                 made_with["dataset's pictures were embedded"] = self._windows.clip_info["weights_sha256"]
@@ -129,7 +131,8 @@ class ClipStep(ProcessorStep):
                     raise ValueError(
                         f"The {what} with other weights of CLIP {self.model} (sha256 {expected[:12]}...) "
                         f"than pretrained={self.pretrained!r} gives (sha256 {clip.weights_sha256[:12]}...). "
-                        "Set --policy.clip.pretrained to the weights used then, or convert the dataset again."
+                        "Convert the dataset again, or set --policy.clip.pretrained of a new policy to the weights used "
+                        "then."
                     )
             self._clip, self.weights_sha256, self._weights = clip, clip.weights_sha256, None
         if device is not None and self._clip.device != torch.device(device):

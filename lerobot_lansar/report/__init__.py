@@ -1,1 +1,1 @@
-"""Tables and plots from what ``lerobot-eval`` wrote; knows neither the desk nor the policy."""
+"""Tables and plots from what ``lerobot-eval`` wrote, and what a LanSAR attends to in a rollout (``attention.py``)."""

@@ -10,7 +10,7 @@ from typing import Any
 import draccus
 from draccus.utils import DraccusException
 
-from lerobot_lansar.report.results import collect, read_eval_info, read_lines, summarise
+from lerobot_lansar.report.results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
 
 
 @dataclass
@@ -50,7 +50,7 @@ def report(config: ReportConfig) -> dict[str, Any]:
         raise FileNotFoundError(f"--results_dir={results_dir} holds no episodes-*.jsonl")
     summary = summarise(collect(entries, lines, config.seed))
     summary["policy_reads_scene_state"] = _reads_scene_state(config.policy_path)
-    summary["notes"] = _notes(summary)
+    summary["notes"] = _notes(summary, named=config.seed is not None or bool(lines))
     summary["lerobot_policy_lansar"] = version("lerobot_policy_lansar")
 
     output_dir = config.output_dir or config.eval_dir
@@ -77,7 +77,8 @@ def _reads_scene_state(policy_path: Path | None) -> bool | None:
     return is_used and "observation.environment_state" in (policy.get("input_features") or {})
 
 
-def _notes(summary: dict[str, Any]) -> list[str]:
+def _notes(summary: dict[str, Any], named: bool) -> list[str]:
+    """What a reader must know; `named` is whether the chains are known or only supposed."""
     notes = []
     assets = summary["settings"]["assets"]
     if assets != "original":
@@ -89,6 +90,11 @@ def _notes(summary: dict[str, Any]) -> list[str]:
         )
     elif summary["policy_reads_scene_state"] is None:
         notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
+    if "in_a_row" in summary and not named:
+        notes.append(
+            f"Nothing says which chains these are: success per task is right only if --seed was {DEFAULT_SEED}, LeRobot's "
+            "default. Give lansar-report the --seed of the evaluation."
+        )
     if "in_a_row" in summary and summary["episodes"] < 1000:
         notes.append(f"{summary['episodes']} of the benchmark's 1000 chains.")
     return notes

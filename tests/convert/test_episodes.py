@@ -74,6 +74,9 @@ def test_play_has_every_frame_once_and_windows_as_annotations(calvin, tmp_path):
     assert set(column(dataset, "calvin.scene").tolist()) == {SCENES.index("D")}
     assert [e["windows"] for e in manifest_of(out)["episodes"]] == [[0, 1], [2]]
     assert dataset.meta.episodes[0]["tasks"] == [NO_COMMAND, sentences[0], sentences[1]]
+    card = (out / "README.md").read_text()
+    assert "--policy.type=lansar" not in card
+    assert "`--mode=windows`" in card
 
 
 def test_a_long_recording_is_cut_where_no_window_is(calvin, tmp_path, monkeypatch):

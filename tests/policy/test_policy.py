@@ -212,7 +212,7 @@ def test_an_action_does_not_depend_on_its_neighbours_not_even_in_the_last_bit(op
     preprocess, _ = make_lansar_pre_post_processors_for(policy)
     rng = np.random.default_rng(0)
     tasks = [["open the drawer"] * 3 if t < 3 else ["open the drawer", "lift", "drop it"] for t in range(6)]
-    observations = [observation(rng, 3) for _ in tasks]
+    observations = [observation(rng, 3, pictures=config.use_images) for _ in tasks]
     together = [
         policy.select_action(preprocess({**o, "task": list(task)}))
         for o, task in zip(observations, tasks, strict=True)
@@ -270,7 +270,7 @@ def test_missing_features_are_named():
 def test_a_policy_without_pictures_says_what_to_do_when_one_needs_them():
     policy = make_policy(use_images=True)
     preprocess, _ = make_lansar_pre_post_processors_for(policy)
-    batch = {k: v for k, v in observation(np.random.default_rng(0), 1).items() if "images" not in k}
+    batch = observation(np.random.default_rng(0), 1)
     with pytest.raises(ValueError, match=r"--env.cameras="):
         preprocess({**batch, "task": ["open the drawer"]})
 
@@ -305,7 +305,7 @@ def test_a_checkpoint_carries_statistics_and_clip_weights(tmp_path):
     loaded = LanSARPolicy.from_pretrained(tmp_path / "checkpoint")
     assert not torch.equal(loaded.scaler.state_mean, torch.zeros(18))
     again, _ = make_pre_post_processors(loaded.config, str(tmp_path / "checkpoint"))
-    batch = observation(np.random.default_rng(0), 2) | {"task": list(COMMANDS[:2])}
+    batch = observation(np.random.default_rng(0), 2, pictures=True) | {"task": list(COMMANDS[:2])}
     expected = policy.select_action(preprocess(dict(batch)))
     assert torch.equal(loaded.select_action(again(dict(batch))), expected)
 

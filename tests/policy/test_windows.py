@@ -5,6 +5,8 @@ import math
 import shutil
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -165,9 +167,6 @@ def test_a_folder_that_cannot_be_written_to_is_read_into_memory(tmp_path, monkey
 def test_nan_in_a_dataset_is_named(tmp_path, monkeypatch):
     episodes = make_dataset(tmp_path / "d", lengths=(6,))
     assert len(episodes) == 1
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     path = frames_module.data_files(tmp_path / "d")[0]
     table = pq.read_table(path)
     values = table["action"].to_pylist()
@@ -176,6 +175,19 @@ def test_nan_in_a_dataset_is_named(tmp_path, monkeypatch):
     pq.write_table(table.set_column(column, "action", pa.array(values, table["action"].type)), path)
     with pytest.raises(ValueError, match=r"action is NaN or infinite in episode 0 \(index 3\)"):
         load_frames(tmp_path / "d")
+
+
+def test_uninterrupted_play_is_refused(tmp_path):
+    make_dataset(tmp_path / "data", lengths=(6, 9))
+    (path,) = frames_module.data_files(tmp_path / "data")
+    table = pq.read_table(path)
+    task = np.append(
+        table["task_index"].to_numpy()[:-1], 0
+    )  # the last frame is of the first episode's command
+    column = table.schema.get_field_index("task_index")
+    pq.write_table(table.set_column(column, "task_index", pa.array(task)), path)
+    with pytest.raises(ValueError, match=r"within episode 1 \(index 14\).*--mode=windows"):
+        load_frames(tmp_path / "data")
 
 
 def test_actions_without_calvins_names_are_refused(relative):

@@ -72,7 +72,14 @@ def test_every_figure_follows_from_eval_info_alone(tmp_path):
 
 def test_another_seed_means_other_chains(tmp_path):
     folder = write_eval(tmp_path, ("calvin", [0.0]))
-    assert list(report(ReportConfig(folder, seed=3))["tasks"]) == ["turn_off_led"]
+    known = report(ReportConfig(folder, seed=3))
+    assert list(known["tasks"]) == ["turn_off_led"]
+    supposed = report(ReportConfig(folder))["notes"]
+    assert (
+        set(supposed) - set(known["notes"])
+        == {note for note in supposed if "--seed was 1000" in note}
+        != set()
+    )
     assert list(report(ReportConfig(folder, seed=2000))["tasks"]) == ["open_drawer"]
 
 
