@@ -208,7 +208,8 @@ def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
         --env.control_mode={request["action"]} --env.task_in_state=true{cameras}"""
     if request["mode"] == "play":
-        return f"""    lerobot-train --policy.type=… --policy.push_to_hub=false --dataset.repo_id={repo_id} --output_dir=outputs/train
+        return f"""    lerobot-train --policy.type=… --policy.push_to_hub=false \\
+        --dataset.repo_id={repo_id} --output_dir=outputs/train
 
 for a policy that reads one frame's command at a time. LanSAR learns demonstrations of one command each and refuses
 this dataset; convert with `--mode=windows` for it."""

@@ -112,7 +112,7 @@ class LanSARPolicy(PreTrainedPolicy):
         self.reset()
 
     def _check_pretrained(self) -> None:
-        """Weights that go on being trained must mean what they meant; other options change a shape, and fail by that."""
+        """Weights that go on being trained must mean what they meant. Other options change a shape and fail by it."""
         if not self.config.pretrained_path:
             return
         trained = PreTrainedConfig.from_pretrained(self.config.pretrained_path)

@@ -131,8 +131,7 @@ class ClipStep(ProcessorStep):
                     raise ValueError(
                         f"The {what} with other weights of CLIP {self.model} (sha256 {expected[:12]}...) "
                         f"than pretrained={self.pretrained!r} gives (sha256 {clip.weights_sha256[:12]}...). "
-                        "Convert the dataset again, or set --policy.clip.pretrained of a new policy to the weights used "
-                        "then."
+                        "Convert the dataset again, or set --policy.clip.pretrained of a new policy to those used then."
                     )
             self._clip, self.weights_sha256, self._weights = clip, clip.weights_sha256, None
         if device is not None and self._clip.device != torch.device(device):

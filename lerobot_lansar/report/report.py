@@ -92,8 +92,8 @@ def _notes(summary: dict[str, Any], named: bool) -> list[str]:
         notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
     if "in_a_row" in summary and not named:
         notes.append(
-            f"Nothing says which chains these are: success per task is right only if --seed was {DEFAULT_SEED}, LeRobot's "
-            "default. Give lansar-report the --seed of the evaluation."
+            f"Nothing says which chains these are: success per task is right only if --seed was {DEFAULT_SEED}, "
+            "LeRobot's default. Give lansar-report the --seed of the evaluation."
         )
     if "in_a_row" in summary and summary["episodes"] < 1000:
         notes.append(f"{summary['episodes']} of the benchmark's 1000 chains.")

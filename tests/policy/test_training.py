@@ -14,7 +14,6 @@ from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
-
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 
 from .conftest import COMMANDS, CONFIGS, SMALL, dataset_meta, make_dataset, small_config
