@@ -2,13 +2,13 @@
 
     python benchmarks/training.py [--preset=lansar] [--root=DATASET] [--batch_size=96] [--updates=10]
         [--device=cpu] [--threads=1] [--output=FILE.json]
-    python benchmarks/training.py --preset=thesis/baseline --batch_size=96 --device=cuda      # the thesis' size
+    python benchmarks/training.py --preset=thesis/baseline --batch_size=96 --num_workers=4 --device=cuda
 
 Reading: milliseconds of CPU per sample, a window of the preset's length (with picture embeddings if it uses them), the
 way LanSAR does it, by LeRobot's own delta timestamps, and the bare lookup in memory-mapped arrays, the floor.
 
-Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader without workers, preprocessor, forward, backward,
-AdamW). FLOP are counted by PyTorch; the ceiling is its product of 2048 x 2048 matrices on the same device and dtype.
+Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, AdamW).
+FLOP are counted by PyTorch; the ceiling is its product of 2048 x 2048 matrices on the same device and dtype.
 Without --root it runs on random demonstrations of 64 steps made in a temporary folder.
 """
 
@@ -43,6 +43,7 @@ class Options:
     preset: str = "lansar"  # configs/<preset>.yaml
     root: Path | None = None  # a LeRobotDataset's folder
     batch_size: int = 96
+    num_workers: int = 0  # processes that fetch samples, as --num_workers of lerobot-train
     updates: int = 10  # measured, after two to warm up
     device: str = "cpu"
     dtype: str = "float32"  # or bfloat16: mixed precision, as --policy.dtype
@@ -143,7 +144,16 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
     policy = LanSARPolicy(config, dataset_meta=dataset.meta).to(options.device).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
-    loader = torch.utils.data.DataLoader(dataset, options.batch_size, shuffle=True, drop_last=True)
+    workers = options.num_workers
+    loader = torch.utils.data.DataLoader(
+        dataset,
+        options.batch_size,
+        shuffle=True,
+        drop_last=True,
+        num_workers=workers,
+        multiprocessing_context="spawn" if workers else None,
+        persistent_workers=workers > 0,
+    )
     if len(loader) == 0:
         raise ValueError(
             f"--batch_size={options.batch_size} is more than the dataset's {len(dataset)} frames."
