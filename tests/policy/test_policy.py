@@ -93,7 +93,13 @@ def make_lansar_pre_post_processors_for(policy):
 
 
 def test_an_absolute_action_is_the_pose_plus_the_unscaled_difference_with_the_thesis_constants():
-    thesis = {"position_scale_start": 3.0, "position_scale_slope": 1.0, "yaw_scale": 1.5, "window": 4}
+    thesis = {
+        "position_scale_start": 3.0,
+        "position_scale_slope": 1.0,
+        "yaw_scale": 1.5,
+        "window": 4,
+        "window_slide": 1,
+    }
     policy = with_prediction(make_policy(**thesis), [1, 2, 3, 0.1, 0.2, 0.3], -1.0)
     policy.scaler.delta_mean[:] = torch.tensor([0.01, 0, 0, 0, 0, 0])
     policy.scaler.delta_std[:] = 0.1
@@ -144,7 +150,7 @@ def windows_of(tasks, clear, window, slide):
     [
         (1, {}),
         (32, {}),
-        (7, {"mlp_norm": "layer", "command_in_context": True}),
+        (7, {"mlp_norm": "layer", "command_in_context": False}),
         (32, {"command_prepended": True}),
     ],
 )
@@ -188,7 +194,7 @@ def test_cached_steps_give_what_the_whole_window_at_once_gives(slide, options, o
 
 
 def test_a_history_is_cleared_for_the_row_whose_command_changes_and_after_the_set_steps():
-    policy = make_policy(history_clear_steps=5, window=4)
+    policy = make_policy(history_clear_steps=5, window=4, window_slide=1)
     rng = np.random.default_rng(0)
     lengths = []
     for t in range(8):
@@ -203,7 +209,7 @@ def test_a_history_is_cleared_for_the_row_whose_command_changes_and_after_the_se
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"mlp_norm": "layer"}, {"use_images": True, "command_in_context": True}]
+    "options", [{}, {"mlp_norm": "layer", "command_in_context": False}, {"use_images": True}]
 )
 def test_an_action_does_not_depend_on_its_neighbours_not_even_in_the_last_bit(options):
     config = small_config(window=4, **options)

@@ -20,7 +20,7 @@ SMALL = {"hidden": 32, "context_layers": 2, "context_heads": 2, "decoder_layers"
 def checkpoint(tmp_path):
     torch.manual_seed(0)
     config = LanSARConfig(
-        device="cpu", push_to_hub=False, feedforward=64, use_images=False, window=8, window_slide=4,
+        device="cpu", push_to_hub=False, feedforward=64, use_images=False, window=8,
         clip=ClipConfig("lansar-tiny", ""), **SMALL,
     )  # fmt: skip
     config.input_features, config.output_features = {}, {}
@@ -45,14 +45,14 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
         "--decoder_steps=[0,10,99]", f"--output_dir={tmp_path / 'out'}",
     )  # fmt: skip
     (attention,) = seen
-    assert attention.tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S"]
-    assert attention.context.shape == (20, 2, 2, 6, 6)
+    assert attention.tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S", "C"]
+    assert attention.context.shape == (20, 2, 2, 7, 7)
     assert attention.frames.shape == (20, 200, 200, 3)
     sums = attention.context.sum(-1)
     np.testing.assert_allclose(sums[:, 0], 1, atol=1e-5)
     np.testing.assert_allclose(sums[:, 1, :, 0], 1, atol=1e-5)
     assert np.isnan(sums[:, 1, :, 1:]).all()  # of the last layer CLS alone is read
-    np.testing.assert_allclose(attention.per_modality().sum(1), 6, atol=1e-4)
+    np.testing.assert_allclose(attention.per_modality().sum(1), 7, atol=1e-4)
     lengths = [
         step["self"].shape[-1] for step in attention.decoder
     ]  # two tokens a step; half is forgotten at 8
