@@ -55,14 +55,6 @@ class LossParts:
         return len(self._terms)
 
 
-def one_row_at_a_time(device: torch.device) -> bool:
-    """Whether environments are decided one by one. On a CPU batching gains little, and the size of a matrix
-    product changes its last bits: so results there are exactly the same for every batch size. On a GPU they are
-    up to rounding.
-    """
-    return device.type == "cpu"
-
-
 class LanSARPolicy(PreTrainedPolicy):
     """Language-commanded Scene-aware Action Response.
 
@@ -207,13 +199,8 @@ class LanSARPolicy(PreTrainedPolicy):
         inputs = [state, environment_state, batch[CLIP_COMMAND]]
         inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
         self._recall(batch["task"])
-        size = 1 if one_row_at_a_time(state.device) else len(state)
         with torch.autocast(state.device.type, enabled=False):  # one step is too little work to gain from it
-            chunks = [
-                self._act(list(range(i, i + size)), *(x[i : i + size] for x in inputs))
-                for i in range(0, len(state), size)
-            ]
-        return torch.cat(chunks)
+            return self._act(*inputs)
 
     def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor) -> None:
         sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, SCENE_DIM + 18))
@@ -258,16 +245,14 @@ class LanSARPolicy(PreTrainedPolicy):
 
     def _act(
         self,
-        rows: list[int],
         state: Tensor,
         environment_state: Tensor,
         command: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
     ) -> Tensor:
-        """Take one step into the histories of `rows` and decide: (b, 15), (b, 24), (b, D)... -> (b, 7)."""
-        config, network = self.config, self.acting
-        histories = [self._histories[row] for row in rows]
+        """Take one step into the histories and decide: (B, 15), (B, 24), (B, D)... -> (B, 7)."""
+        config, network, histories = self.config, self.acting, self._histories
         x, blocks, scene = self.scaler.encode(state, environment_state)
         for i, history in enumerate(histories):
             if history.projections is None:
@@ -275,17 +260,17 @@ class LanSARPolicy(PreTrainedPolicy):
         projections = [h.projections for h in histories if h.projections is not None]
         commands = torch.cat([c for c, _ in projections]), torch.cat([c for _, c in projections])
         modalities = network.modalities(x, blocks, scene, static, gripper)
-        contexts = network.encode_context(modalities, commands[0])  # (b, h)
+        contexts = network.encode_context(modalities, commands[0])  # (B, h)
         states = network.state_target(x)
         for i, history in enumerate(histories):
             if len(history.contexts) == config.window:  # forget the oldest steps, move the others up
                 history.contexts = history.contexts[config.window_slide :]
                 history.states = history.states[config.window_slide :]
-                self._cache.steps[rows[i]] = 0
+                self._cache.steps[i] = 0
             history.steps += 1
             history.contexts = torch.cat([history.contexts, contexts[i : i + 1]])
             history.states = torch.cat([history.states, states[i : i + 1]])
-        last = self._decode(rows, commands)
+        last = self._decode(commands)
         length = torch.tensor([len(history.contexts) for history in histories], device=state.device)
         motion, logit = network.predict(last)
         delta = self.scaler.unscale_delta(motion)
@@ -298,19 +283,17 @@ class LanSARPolicy(PreTrainedPolicy):
         relative = torch.cat([position / POSITION_UNIT, orientation / ORIENTATION_UNIT], dim=1)
         return torch.cat([relative.clamp(-1, 1), grip], dim=1)
 
-    def _decode(self, rows: list[int], commands: tuple[Tensor, Tensor]) -> Tensor:
-        """The decoder's output at the newest step of `rows`, (b, h); only steps that are not in the cache cost
+    def _decode(self, commands: tuple[Tensor, Tensor]) -> Tensor:
+        """The decoder's output at every row's newest step, (B, h); only steps that are not in the cache cost
         anything.
         """
-        last = commands[0].new_empty(len(rows), self.config.hidden)
+        last = torch.empty_like(commands[0])
         groups: dict[tuple[int, bool], list[int]] = {}  # rows that need the same number of new steps
-        for i, row in enumerate(rows):
-            held = self._cache.steps[row]
-            new = len(self._histories[row].contexts) - held
-            groups.setdefault((new, held == 0), []).append(i)
+        for row, (history, held) in enumerate(zip(self._histories, self._cache.steps, strict=True)):
+            groups.setdefault((len(history.contexts) - held, held == 0), []).append(row)
         for (new, _), members in groups.items():
-            past = self._cache.add([rows[i] for i in members], new)
-            histories = [self._histories[rows[i]] for i in members]
+            past = self._cache.add(members, new)
+            histories = [self._histories[row] for row in members]
             contexts = torch.stack([history.contexts[-new:] for history in histories])
             states = torch.stack([history.states[-new:] for history in histories])
             command = commands[0][members], commands[1][members]

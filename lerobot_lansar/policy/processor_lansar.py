@@ -146,8 +146,7 @@ class ClipStep(ProcessorStep):
             raise ValueError("LanSAR needs a command: no `task` in the batch (from the dataset, or the env).")
         clip = self.clip(observation[OBS_STATE].device)
         for sentence in set(tasks) - self._commands.keys():
-            # One at a time: an embedding must not depend, not even in its last bit, on what else is in the
-            # batch.
+            # One at a time: it is kept, and must not depend on what else was in the first batch.
             self._commands[sentence] = clip.encode_texts([sentence])[0]
         observation[CLIP_COMMAND] = torch.stack([self._commands[sentence] for sentence in tasks])
         if self.use_images:
@@ -164,10 +163,7 @@ class ClipStep(ProcessorStep):
                 f"This LanSAR looks at pictures, but there is no {key}. Evaluate with "
                 "--env.cameras='[static,gripper]', or train one without pictures (--policy.use_images=false)."
             )
-        images = observation[key]
-        if clip.device.type == "cpu":  # batching gains little there, and would change the last bits
-            return torch.cat([clip.encode_images(image[None]) for image in images])
-        return clip.encode_images(images)
+        return clip.encode_images(observation[key])
 
     def get_config(self) -> dict[str, Any]:
         sha256 = self.clip().weights_sha256
