@@ -5,7 +5,7 @@
 Weights are random, which costs the same as trained ones, and nothing is downloaded. All policies at their default
 settings, on the desk's observations (state, static 200 x 200 and gripper 84 x 84 picture; Diffusion and VQ-BeT, which
 take pictures of one size only, or one picture, get the static one). Counted per executed action: the time of a chunk is
-divided by the actions carried out.
+divided by the actions carried out, that of several environments by their number.
 
 LanSAR is measured with a full history: 64 control steps, in which one with --policy.window_slide=32 decodes its whole
 window twice. 30 Hz leaves 33 ms per step.
@@ -14,7 +14,7 @@ window twice. 30 Hz leaves 33 ms per step.
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,8 @@ def lansar(options: Options, preset: str, slide: int, name: str) -> dict[str, An
         seconds["preprocessor"].append(timed(options, lambda: seen.update(preprocess(batch))))  # noqa: B023
         seconds["policy"].append(timed(options, lambda: policy.select_action(seen)))
     mean = {what: sum(times) / len(times) for what, times in seconds.items()}
-    return row(name, policy, mean["preprocessor"], mean["policy"], max(seconds["policy"]))
+    each = [value / options.environments for value in mean.values()]
+    return row(name, policy, each[0], each[1], max(seconds["policy"]))
 
 
 def whole_window(options: Options, preset: str, name: str) -> dict[str, Any]:
@@ -114,7 +115,7 @@ def whole_window(options: Options, preset: str, name: str) -> dict[str, Any]:
 
     forward()
     times = [timed(options, forward) for _ in tqdm(range(10), desc=name, leave=False)]
-    return row(name, policy, None, sum(times) / len(times), max(times))
+    return row(name, policy, None, sum(times) / len(times) / rows, max(times))
 
 
 def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) -> dict[str, Any]:
@@ -136,7 +137,8 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
         timed(options, lambda: policy.select_action(dict(batch)))
         for _ in tqdm(range(count), desc=name, leave=False)
     ]
-    return row(f"{name}, {chunk} actions a prediction", policy, None, sum(times) / count, max(times))
+    seconds = sum(times) / count / options.environments
+    return row(f"{name}, {chunk} actions a prediction", policy, None, seconds, max(times))
 
 
 def row(
@@ -159,11 +161,14 @@ def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     thesis, recommended = "thesis/baseline", "lansar"
+    ten = replace(options, environments=10)
     rows = [
         lansar(options, thesis, 32, "LanSAR thesis size, steps kept (window_slide=32)"),
         lansar(options, thesis, 1, "LanSAR thesis size, window decoded at every step (window_slide=1)"),
         whole_window(options, thesis, "LanSAR thesis size, nothing kept"),
+        lansar(ten, thesis, 32, "LanSAR thesis size, steps kept, ten environments at once"),
         lansar(options, recommended, 8, "LanSAR recommended, steps kept"),
+        lansar(ten, recommended, 8, "LanSAR recommended, steps kept, ten environments at once"),
         lansar(options, recommended, 1, "LanSAR recommended, window decoded at every step"),
         other(options, ACTConfig(pretrained_backbone_weights=None), ("static", "gripper"), "ACT"),
         other(options, VQBeTConfig(pretrained_backbone_weights=None), ("static",), "VQ-BeT"),
