@@ -76,7 +76,6 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "contrastive loss, weight 0.1": (["--policy.contrastive_weight=0.1"], []),
     "noise on the state, 3 mm and 3 mrad": (["--policy.state_noise=0.003"], []),
     "paraphrases": (["--policy.paraphrases=true"], []),
-    "averaged weights, decay 0.998": (["--policy.ema_decay=0.998"], []),
     "window slides by 1": ([], SLIDE),
     "windows of 64 steps, 24 a batch": (
         ["--policy.window=64", "--policy.window_slide=32", "--batch_size=24"],

@@ -59,7 +59,6 @@ class LanSARConfig(PreTrainedConfig):
             standard deviation, in its own units, m and rad.
         contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out; those
             of the same CALVIN task are not held against each other (the dataset's column calvin.task).
-        ema_decay: the network that acts is a running average of the trained one with this decay; 0 = none.
         dtype: "float32", or "bfloat16" for mixed-precision training on a GPU that has it.
         smooth_l1_beta: beta of Eq 4.3, 4.4.
         learning_rate, weight_decay, warmup_fraction: AdamW and its schedule (Table 4.2).
@@ -97,7 +96,6 @@ class LanSARConfig(PreTrainedConfig):
     paraphrases: bool = False
     state_noise: float = 0.0
     contrastive_weight: float = 0.0
-    ema_decay: float = 0.0
     dtype: str = "float32"
 
     smooth_l1_beta: float = 0.1
@@ -145,8 +143,6 @@ class LanSARConfig(PreTrainedConfig):
         for name in ("state_noise", "contrastive_weight"):
             if getattr(self, name) < 0:
                 raise ValueError(f"--policy.{name}={getattr(self, name)} must be 0 or more.")
-        if not 0 <= self.ema_decay < 1:
-            raise ValueError(f"--policy.ema_decay={self.ema_decay} must be at least 0 and below 1.")
         if not 0 <= self.window_slide <= self.window:
             raise ValueError(
                 f"--policy.window_slide={self.window_slide} must lie between 1 and --policy.window={self.window}, or "

@@ -10,7 +10,6 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from .configuration_lansar import LanSARConfig
 from .network import DecoderCache, LanSARNetwork
@@ -81,11 +80,6 @@ class LanSARPolicy(PreTrainedPolicy):
         config.validate_features()
         self.scaler = Scaler(config.orientation, config.egocentric_blocks)
         self.network = LanSARNetwork(config.network)
-        self.averaged: AveragedModel | None = None
-        if config.ema_decay:
-            average = get_ema_multi_avg_fn(config.ema_decay)
-            self.averaged = AveragedModel(self.network, multi_avg_fn=average, use_buffers=True)
-            self.averaged.requires_grad_(False)
         if dataset_meta is not None:
             self._check_pretrained()
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
@@ -118,20 +112,7 @@ class LanSARPolicy(PreTrainedPolicy):
                 )
 
     def get_optim_params(self) -> Any:
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
-
-    def update(self) -> None:
-        """Take the new weights into their average; LeRobot calls this after every update."""
-        if self.averaged is not None:
-            self.averaged.update_parameters(self.network)
-
-    @property
-    def acting(self) -> LanSARNetwork:
-        """The network that acts: the averaged one, once there is one."""
-        if self.averaged is None or self.averaged.n_averaged == 0:
-            return self.network
-        averaged: LanSARNetwork = self.averaged.module  # type: ignore[assignment]
-        return averaged
+        return list(self.parameters())
 
     def reset(self) -> None:
         """Forget every environment's history; LeRobot calls this when a batch of episodes begins."""
@@ -157,9 +138,8 @@ class LanSARPolicy(PreTrainedPolicy):
             state = torch.cat([state[..., :3], wrap(state[..., 3:6]), state[..., 6:]], dim=-1)
         state, blocks, scene = self.scaler.encode(state, batch[OBS_ENV_STATE])
         static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
-        network = self.network if self.training else self.acting
         command, same = batch[CLIP_COMMAND], batch.get(COMMAND_GROUP)
-        motion, logit, contrast = network(command, state, blocks, scene, rows, static, gripper, same)
+        motion, logit, contrast = self.network(command, state, blocks, scene, rows, static, gripper, same)
         goal = batch[ACTION].flatten(0, 1)[rows]  # (N, 7)
         delta = self.scaler.scale_delta(goal[:, :6])
         beta = self.config.smooth_l1_beta
@@ -252,7 +232,7 @@ class LanSARPolicy(PreTrainedPolicy):
         gripper: Tensor | None = None,
     ) -> Tensor:
         """Take one step into the histories and decide: (B, 15), (B, 24), (B, D)... -> (B, 7)."""
-        config, network, histories = self.config, self.acting, self._histories
+        config, network, histories = self.config, self.network, self._histories
         x, blocks, scene = self.scaler.encode(state, environment_state)
         for i, history in enumerate(histories):
             if history.projections is None:
@@ -297,6 +277,6 @@ class LanSARPolicy(PreTrainedPolicy):
             contexts = torch.stack([history.contexts[-new:] for history in histories])
             states = torch.stack([history.states[-new:] for history in histories])
             command = commands[0][members], commands[1][members]
-            decoded = self.acting.decode(contexts, states, command, past)
+            decoded = self.network.decode(contexts, states, command, past)
             last[members] = decoded[:, -1]
         return last

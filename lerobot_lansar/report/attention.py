@@ -113,7 +113,7 @@ def observe(config: AttentionConfig) -> Attention:
         config.policy, pretrained_path=str(config.policy.pretrained_path), preprocessor_overrides=overrides
     )
     env_preprocessor, env_postprocessor = make_env_pre_post_processors(config.env, config.policy)
-    network = policy.acting
+    network = policy.network
     context: list[np.ndarray] = []
     decoder: list[dict[str, np.ndarray]] = []
     frames: list[np.ndarray] = []

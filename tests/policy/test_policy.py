@@ -395,29 +395,6 @@ def test_the_training_presets_are_table_4_2s():
     assert config.observation_delta_indices is config.action_delta_indices is None
 
 
-def test_the_averaged_network_acts_and_is_saved(tmp_path):
-    policy = make_policy(ema_decay=0.9)
-    trained = policy.network.cls.weight
-    assert policy.acting is policy.network  # nothing to average yet
-    start = trained.detach().clone()
-    policy.update()
-    averaged = policy.acting.cls.weight
-    with torch.no_grad():
-        trained += 1
-    policy.update()
-    torch.testing.assert_close(averaged, start + 0.1)
-    assert len(policy.get_optim_params()) == len(list(policy.network.parameters()))
-    policy.config.input_features, policy.config.output_features = {}, {}
-    policy.save_pretrained(tmp_path)
-    torch.testing.assert_close(LanSARPolicy.from_pretrained(tmp_path).acting.cls.weight, averaged)
-    rng = np.random.default_rng(0)
-    _, action = step(policy, rng, ["open the drawer"])
-    with torch.no_grad():
-        trained += 100
-    policy.reset()
-    assert torch.equal(step(policy, np.random.default_rng(0), ["open the drawer"])[1], action)
-
-
 def test_mixed_precision_changes_neither_what_is_kept_nor_what_is_decided():
     policy = make_policy()
     _, expected = step(policy, np.random.default_rng(0), ["open the drawer"])
