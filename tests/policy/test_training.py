@@ -112,8 +112,8 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
     policy = [f"--policy.{key}={json.dumps(value)}" for key, value in SMALL.items()]
     first = ["--policy.type=lansar", *policy, "--policy.clip.model=lansar-tiny", "--policy.clip.pretrained=",
              "--policy.dtype=bfloat16", "--dataset.repo_id=test/desk",
-             f"--dataset.root={tmp_path / 'data'}", f"--output_dir={tmp_path / 'out'}", "--batch_size=4", "--steps=4", "--save_freq=2", "--num_workers=0",
-             "--log_freq=1"]  # fmt: skip
+             f"--dataset.root={tmp_path / 'data'}", f"--output_dir={tmp_path / 'out'}", "--batch_size=4", "--steps=4",
+             "--save_freq=2", "--num_workers=0", "--log_freq=1"]  # fmt: skip
     config = tmp_path / "out/checkpoints/last/pretrained_model/train_config.json"
     launcher = [sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2"]
     environment = {
