@@ -77,14 +77,8 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "noise on the state, 3 mm and 3 mrad": (["--policy.state_noise=0.003"], []),
     "paraphrases": (["--policy.paraphrases=true"], []),
     "window slides by 1": ([], SLIDE),
-    "windows of 64 steps, 24 a batch": (
-        ["--policy.window=64", "--policy.window_slide=32", "--batch_size=24"],
-        [],
-    ),
-    "windows of 8 steps, 192 a batch": (
-        ["--policy.window=8", "--policy.window_slide=4", "--batch_size=192"],
-        [],
-    ),
+    "windows of 64 steps, 24 a batch": (["--policy.window=64", "--batch_size=24"], []),
+    "windows of 8 steps, 192 a batch": (["--policy.window=8", "--batch_size=192"], []),
     "hidden 128, feedforward 512": (["--policy.hidden=128", "--policy.feedforward=512"], []),
     "learning rate 0.002": (["--policy.learning_rate=0.002"], []),
 }
