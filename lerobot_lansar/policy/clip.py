@@ -1,8 +1,8 @@
 """CLIP through open_clip: pictures and commands in, embeddings out (Eq 3.2-3.4).
 
 Embeddings are CLIP's own outputs, not divided by their norm. Converting a dataset and running the policy go
-through this one class, so a stored and a freshly computed embedding of the same picture agree (to about 1e-3 on
-GPUs, where LeRobot's commands allow TF32 products).
+through this one class, so a stored and a freshly computed embedding of the same picture agree (on a GPU
+as closely as TF32 products do, which LeRobot's commands allow).
 """
 
 import contextlib

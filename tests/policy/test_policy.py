@@ -1,6 +1,7 @@
 """The policy as LeRobot drives it: loss, histories, actions, checkpoints, errors."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -328,9 +329,14 @@ def test_embeddings_made_with_other_clip_weights_are_refused(tmp_path):
         ClipStep("lansar-tiny", "", weights_sha256="e" * 64).clip("cpu")
 
 
-def test_clip_follows_the_observations_to_their_device():
-    from lerobot_lansar.policy.processor_lansar import ClipStep
+def test_a_checkpoints_clip_cannot_be_changed_by_training_on():
+    clip_step = ClipStep("lansar-tiny", "")
+    clip_step._windows = SimpleNamespace(clip=ClipConfig("lansar-tiny", "other.pt"))
+    with pytest.raises(ValueError, match=r"--policy.clip.pretrained=other.pt cannot be changed"):
+        clip_step.clip("cpu")
 
+
+def test_clip_follows_the_observations_to_their_device():
     clip_step = ClipStep("lansar-tiny", "")
     clip_step._windows = None  # of another test's policy
     clip_step.get_config()  # saved before its first use, on the CPU

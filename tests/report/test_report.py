@@ -75,11 +75,8 @@ def test_another_seed_means_other_chains(tmp_path):
     known = report(ReportConfig(folder, seed=3))
     assert list(known["tasks"]) == ["turn_off_led"]
     supposed = report(ReportConfig(folder))["notes"]
-    assert (
-        set(supposed) - set(known["notes"])
-        == {note for note in supposed if "--seed was 1000" in note}
-        != set()
-    )
+    (warning,) = set(supposed) - set(known["notes"])
+    assert "--seed was 1000" in warning
     assert list(report(ReportConfig(folder, seed=2000))["tasks"]) == ["open_drawer"]
 
 
