@@ -30,7 +30,7 @@ import yaml
 from filelock import FileLock
 from tqdm import tqdm
 
-from lerobot_lansar.policy.frames import dataset_fingerprint
+from lerobot_lansar.clip.store import dataset_fingerprint
 
 COMMANDS = Path(__file__).parents[1] / "scripts/commands.yaml"
 UNTRAINED_CLIP = ["--policy.clip.model=lansar-tiny", "--policy.clip.pretrained="]
@@ -135,11 +135,18 @@ def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]
         if not minutes.exists():
             shutil.rmtree(folder / "train", ignore_errors=True)
             seconds = command(
-                "lerobot-train", f"--config_path={options.config}", "--dataset.repo_id=lansar/ablations",
-                f"--dataset.root={options.root}", f"--output_dir={folder / 'train'}", f"--seed={seed}",
-                f"--steps={options.updates}", f"--save_freq={options.updates}", *UNTRAINED_CLIP, *changes,
+                "lerobot-train",
+                f"--config_path={options.config}",
+                "--dataset.repo_id=lansar/ablations",
+                f"--dataset.root={options.root}",
+                f"--output_dir={folder / 'train'}",
+                f"--seed={seed}",
+                f"--steps={options.updates}",
+                f"--save_freq={options.updates}",
+                *UNTRAINED_CLIP,
+                *changes,
                 log=folder / "train.log",
-            )  # fmt: skip
+            )
             minutes.write_text(json.dumps(seconds / 60))
         return checkpoint, json.loads(minutes.read_text())
 
@@ -153,12 +160,22 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
         log = folder.with_suffix(".log")
         command(
-            "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=calvin", "--env.control_mode=abs",
-            "--env.cameras=[]", f"--env.annotations={COMMANDS}", "--env.render_fps=1",
-            f"--env.results_dir={folder}", *evaluation, f"--eval.n_episodes={options.chains}",
-            "--eval.batch_size=10", "--eval.use_async_envs=false", "--seed=0",
-            f"--output_dir={folder}", log=log,
-        )  # fmt: skip
+            "lerobot-eval",
+            f"--policy.path={checkpoint}",
+            "--env.type=calvin",
+            "--env.control_mode=abs",
+            "--env.cameras=[]",
+            f"--env.annotations={COMMANDS}",
+            "--env.render_fps=1",
+            f"--env.results_dir={folder}",
+            *evaluation,
+            f"--eval.n_episodes={options.chains}",
+            "--eval.batch_size=10",
+            "--eval.use_async_envs=false",
+            "--seed=0",
+            f"--output_dir={folder}",
+            log=log,
+        )
         command("lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
     report = json.loads((folder / "report.json").read_text())
     figures = {name: report[name] for name in ("average_length", "in_a_row", "local_success_rate", "tasks")}

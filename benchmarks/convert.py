@@ -1,4 +1,4 @@
-"""How fast a CALVIN folder becomes a LeRobotDataset: ``lansar-convert`` against a loop over LeRobot's ``add_frame``.
+"""How fast a CALVIN folder becomes a LeRobotDataset: `lansar-convert` against a loop over LeRobot's `add_frame`.
 
     python benchmarks/convert.py [--root=DIR] [--episodes=136] [--repeat=4] [--loop_episodes=20] [--output=FILE.json]
 
@@ -72,10 +72,8 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
     frames, started = 0, time.perf_counter()
     dataset = LeRobotDataset.create(
         "benchmark/desk", 30, features, target, "panda", use_videos=images == "video", image_writer_threads=4, **codec
-    )  # fmt: skip
-    for number, window in enumerate(
-        tqdm(split.windows[:episodes], desc="add_frame", unit="episode", leave=False)
-    ):
+    )
+    for number, window in enumerate(tqdm(split.windows[:episodes], desc="add_frame", unit="episode", leave=False)):
         for frame in range(window.start, window.end):
             with np.load(split.frame_file(frame)) as content:
                 item = {
@@ -86,7 +84,7 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
                     "observation.images.static": content["rgb_static"],
                     "observation.images.gripper": content["rgb_gripper"],
                 }
-            numbers = {"frame": frame, "window": number, "task": TASKS.index(window.task), "scene": 0}
+            numbers = {"frame": frame, "window": number, "task": list(TASKS).index(window.task), "scene": 0}
             item |= {f"calvin.{name}": np.array([value]) for name, value in numbers.items()}
             dataset.add_frame({**item, "task": window.sentence})
             frames += 1
@@ -98,10 +96,16 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
 def command(root: Path, encoder: RGBEncoder, images: str, workers: int, target: Path) -> Measured:
     """Converts all with lansar-convert."""
     words = [
-        sys.executable, "-m", "dataset_convert", f"--root={root}", "--repo_id=benchmark/desk", f"--workers={workers}",
-        f"--output_dir={target}", f"--images={images}",
+        sys.executable,
+        "-m",
+        "dataset_convert",
+        f"--root={root}",
+        "--repo_id=benchmark/desk",
+        f"--workers={workers}",
+        f"--output_dir={target}",
+        f"--images={images}",
         *(f"--rgb_encoder.{name}={value}" for name, value in asdict(encoder).items() if value is not None),
-    ]  # fmt: skip
+    ]
     started = time.perf_counter()
     subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     spent = time.perf_counter() - started
@@ -112,9 +116,15 @@ def command(root: Path, encoder: RGBEncoder, images: str, workers: int, target: 
 def record(episodes: int, target: Path) -> None:
     """Demonstrations with pictures, as lansar-record makes them."""
     words = [
-        sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", f"--episodes={episodes}",
-        "--validation_episodes=2", "--workers=2", "--cameras=[static,gripper]",
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "lerobot_lansar.demos.record",
+        f"--output_dir={target}",
+        f"--episodes={episodes}",
+        "--validation_episodes=2",
+        "--workers=2",
+        "--cameras=[static,gripper]",
+    ]
     subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
 
 
@@ -155,9 +165,7 @@ def main() -> None:
             rows[f"add_frame, {codec}"] = loop(root, options.loop_episodes, encoder, images, target)
             shutil.rmtree(target)
             for workers in counts:
-                rows[f"lansar-convert, {codec}, {workers} workers"] = command(
-                    many, encoder, images, workers, target
-                )
+                rows[f"lansar-convert, {codec}, {workers} workers"] = command(many, encoder, images, workers, target)
                 shutil.rmtree(target)
     print("| | frames per second | MB per 1000 frames |\n| --- | ---: | ---: |")
     for way, row in rows.items():

@@ -18,8 +18,9 @@ import numpy as np
 from tqdm import tqdm
 
 import lerobot_lansar
+from lerobot_lansar.calvin import TASKS
 from lerobot_lansar.demos.demonstrator import demonstrate
-from lerobot_lansar.desk import TASKS, Desk, SimulationError
+from lerobot_lansar.desk import Desk, SimulationError
 
 SEED = 1_000_000
 

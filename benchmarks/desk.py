@@ -57,9 +57,14 @@ class Naive:
         arm = [(joint, value, 200, 2) for joint, value in enumerate(joints)]
         for joint, value, force, velocity in [*arm, (9, 0.04, 2, 1), (11, 0.04, 2, 1)]:
             p.setJointMotorControl2(
-                bodyIndex=robot, jointIndex=joint, controlMode=p.POSITION_CONTROL, force=force, targetPosition=value,
-                maxVelocity=velocity, physicsClientId=client,
-            )  # fmt: skip
+                bodyIndex=robot,
+                jointIndex=joint,
+                controlMode=p.POSITION_CONTROL,
+                force=force,
+                targetPosition=value,
+                maxVelocity=velocity,
+                physicsClientId=client,
+            )
         for _ in range(8):
             p.stepSimulation(physicsClientId=client)
         self._picture(200, STATIC_EYE, STATIC_TARGET, STATIC_UP, "static")
@@ -96,7 +101,7 @@ def actions(seed: int = 0) -> Callable[[], np.ndarray]:
 
 
 def seconds_per_step(step: Callable[[], object], steps: int) -> float:
-    """Mean wall time of ``step`` over ``steps`` calls; a step that returns a number has timed itself."""
+    """Mean wall time of `step` over `steps` calls; a step that returns a number has timed itself."""
     total = 0.0
     for _ in range(steps):
         started = time.perf_counter()
@@ -150,7 +155,7 @@ def run_alone(options: Options, steps: int, ready: object, go: object, result: o
 
 
 def two_processes(options: Options, processes: int) -> float:
-    """Control steps per second of ``processes`` desks with both cameras at the same time."""
+    """Control steps per second of `processes` desks with both cameras at the same time."""
     context = multiprocessing.get_context("spawn")
     ready, go, result = context.Semaphore(0), context.Event(), context.Queue()
     arguments = (options, options.steps * 3, ready, go, result)
@@ -216,9 +221,7 @@ def main() -> None:
         except DeskError as error:
             print(f"{ours} not compared with {reference}: {error}")
     for name, means in compared.items():
-        print(
-            f"mean picture difference {name}: static {means['static']:.4f}, gripper {means['gripper']:.4f} of 255"
-        )
+        print(f"mean picture difference {name}: static {means['static']:.4f}, gripper {means['gripper']:.4f} of 255")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         figures = {

@@ -41,9 +41,7 @@ class Options:
     device: str = "cpu"
     threads: int = 1
     environments: int = 1
-    steps: int = (
-        64  # of LanSAR, after its history is full; the others carry out two chunks, 16 actions at least
-    )
+    steps: int = 64  # of LanSAR, after its history is full; the others carry out two chunks, 16 actions at least
     output: Path | None = None
 
 
@@ -134,8 +132,7 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
         policy.select_action(dict(batch))
     count = chunk * max(2, -(-16 // chunk))
     times = [
-        timed(options, lambda: policy.select_action(dict(batch)))
-        for _ in tqdm(range(count), desc=name, leave=False)
+        timed(options, lambda: policy.select_action(dict(batch))) for _ in tqdm(range(count), desc=name, leave=False)
     ]
     seconds = sum(times) / count / options.environments
     return row(f"{name}, {chunk} actions a prediction", policy, None, seconds, max(times))

@@ -3,7 +3,7 @@
     python benchmarks/recording.py [--assets=DIR] [--episodes=68] [--output=FILE.json]
 
 Shares come from timers around the desk's physics, pictures and oracle, the sampling of start states and the writing of
-files, in one process; planning is what is left. Rates of one and two workers are those of whole ``lansar-record``
+files, in one process; planning is what is left. Rates of one and two workers are those of whole `lansar-record`
 commands, start included.
 """
 
@@ -89,9 +89,15 @@ def command(options: Options, cameras: list[str], workers: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "desk"
         words = [
-            sys.executable, "-m", "lerobot_lansar.demos.record", f"--output_dir={target}", f"--workers={workers}",
-            f"--episodes={6 * options.episodes}", "--validation_episodes=2", f"--cameras=[{','.join(cameras)}]",
-        ]  # fmt: skip
+            sys.executable,
+            "-m",
+            "lerobot_lansar.demos.record",
+            f"--output_dir={target}",
+            f"--workers={workers}",
+            f"--episodes={6 * options.episodes}",
+            "--validation_episodes=2",
+            f"--cameras=[{','.join(cameras)}]",
+        ]
         if options.assets is not None:
             words.append(f"--assets={options.assets}")
         started = time.perf_counter()

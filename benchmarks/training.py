@@ -29,11 +29,11 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
 
+from lerobot_lansar.calvin import ACTION_NAMES
+from lerobot_lansar.clip.store import IMAGE_FEATURES, clip_dir, dataset_fingerprint
 from lerobot_lansar.policy import make_lansar_pre_post_processors
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
-from lerobot_lansar.policy.frames import CAMERAS, clip_dir, dataset_fingerprint
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
-from lerobot_lansar.policy.windows import ACTION_NAMES
 
 
 @dataclass
@@ -52,15 +52,13 @@ class Options:
 
 
 def random_dataset(root: Path, embedding: int, episodes: int = 20, length: int = 64) -> None:
-    """A LeRobotDataset of random numbers, with ``embedding`` numbers per picture among its columns if not 0."""
+    """A LeRobotDataset of random numbers, with `embedding` numbers per picture among its columns if not 0."""
     sizes = {"observation.state": 15, "observation.environment_state": 24, "action": 7}
     if embedding:
-        sizes |= {f"observation.clip.{name}": embedding for name in CAMERAS}
+        sizes |= {f"observation.clip.{name}": embedding for name in IMAGE_FEATURES}
     names = {"action": ACTION_NAMES["rel"]}
     features = {k: {"dtype": "float32", "shape": (size,), "names": names.get(k)} for k, size in sizes.items()}
-    dataset = LeRobotDataset.create(
-        "benchmark/random", fps=30, features=features, root=root, use_videos=False
-    )
+    dataset = LeRobotDataset.create("benchmark/random", fps=30, features=features, root=root, use_videos=False)
     rng = np.random.default_rng(0)
     for _ in tqdm(range(episodes), desc="Making demonstrations", leave=False):
         for _ in range(length):
@@ -73,7 +71,7 @@ def random_dataset(root: Path, embedding: int, episodes: int = 20, length: int =
 def random_embeddings(root: Path, frames: int, model: str, size: int) -> None:
     """Picture embeddings of random numbers beside a dataset that has none."""
     clip_dir(root).mkdir()
-    for key in CAMERAS.values():
+    for key in IMAGE_FEATURES.values():
         values = np.random.default_rng(0).normal(size=(frames, size)).astype(np.float16)
         np.save(clip_dir(root) / f"{key}.npy", values)
     info = {"model": model, "pretrained": "", "weights_sha256": "", "embed_dim": size, "frames": frames}
@@ -112,9 +110,7 @@ def reading(config: LanSARConfig, scratch: Path) -> dict[str, float]:
     rows = np.random.default_rng(0).integers(0, 640, 96)
     arrays = [*lookup.windows.arrays.values(), *lookup.windows.embeddings.values()]
     steps = rows[:, None] + np.arange(config.window)
-    found["bare lookup"] = cpu_ms(
-        lambda: [torch.from_numpy(np.asarray(a[steps])).float() for a in arrays], 96
-    )
+    found["bare lookup"] = cpu_ms(lambda: [torch.from_numpy(np.asarray(a[steps])).float() for a in arrays], 96)
     del policy
     return found
 
@@ -155,9 +151,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
         persistent_workers=workers > 0,
     )
     if len(loader) == 0:
-        raise ValueError(
-            f"--batch_size={options.batch_size} is more than the dataset's {len(dataset)} frames."
-        )
+        raise ValueError(f"--batch_size={options.batch_size} is more than the dataset's {len(dataset)} frames.")
     dtype = getattr(torch, options.dtype)
     device_type = torch.device(options.device).type
 
@@ -181,9 +175,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
         batch = preprocess(next(source))
         finished(options.device)
         ready = time.perf_counter()
-        if (
-            number == 0
-        ):  # counted where attention is made of matrix products; fused kernels go uncounted on a CPU
+        if number == 0:  # counted where attention is made of matrix products; fused kernels go uncounted on a CPU
             with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
                 update(batch)
             operations = counter.get_total_flops() // len(batch["valid_steps"])
@@ -226,9 +218,7 @@ def main(options: Options) -> None:
         print(f"{name:>24}  {number if isinstance(number, str | int) else round(number, 4)}")
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        settings = {
-            k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items() if k != "output"
-        }
+        settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items() if k != "output"}
         result = {"settings": settings, "reading_ms": read, "updates": row}
         options.output.write_text(json.dumps(result, indent=2) + "\n")
 

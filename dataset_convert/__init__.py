@@ -1,1 +1,1 @@
-"""CALVIN demonstrations as LeRobotDatasets: ``lansar-convert`` or ``python -m dataset_convert``."""
+"""CALVIN demonstrations as LeRobotDatasets: `lansar-convert` or `python -m dataset_convert`."""

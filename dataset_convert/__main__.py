@@ -1,4 +1,4 @@
-"""``python -m dataset_convert`` is ``lansar-convert``."""
+"""`python -m dataset_convert` is `lansar-convert`."""
 
 import sys
 

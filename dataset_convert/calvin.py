@@ -1,63 +1,43 @@
 """Reading one split of a CALVIN dataset from disk: the language index, the scenes and the frames.
 
-Layout of a split (``training/`` or ``validation/``), of the public data and of ``lansar-record`` alike::
+Layout of a split (`training/` or `validation/`), of the public data and of `lansar-record` alike::
 
     episode_0000000.npz ...            one file per frame
     ep_start_end_ids.npy               (N, 2) first and last frame of each uninterrupted recording
     scene_info.npy                     pickled {scene name: [first frame, last frame]}
     lang_annotations/auto_lang_ann.npy pickled {"language": {"ann", "task"}, "info": {"indx"}}
 
-A language window is ``[start, end)``: its end is exclusive. Recordings and scenes include their last frame.
+A language window is `[start, end)`: its end is exclusive. Recordings and scenes include their last frame.
 """
 
 import errno
 import hashlib
-import io
 import os
-import pickle
-import pickletools
-import re
 import reprlib
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-FPS = 30
-"""CALVIN's control and recording frequency in Hz."""
-
-COLOURS = ("red", "blue", "pink")
-"""The order in which every dataset written here stores the blocks."""
-
-SCENES = ("A", "B", "C", "D")
-
-TASKS = (
-    *(f"rotate_{colour}_block_{side}" for colour in COLOURS for side in ("right", "left")),
-    *(f"push_{colour}_block_{side}" for colour in COLOURS for side in ("right", "left")),
-    *("move_slider_left", "move_slider_right", "open_drawer", "close_drawer"),
-    *(f"lift_{colour}_block_{place}" for colour in COLOURS for place in ("table", "slider", "drawer")),
-    *("place_in_slider", "place_in_drawer", "stack_block", "unstack_block"),
-    *("turn_on_lightbulb", "turn_off_lightbulb", "turn_on_led", "turn_off_led", "push_into_drawer"),
-)
-"""CALVIN's 34 tasks; a task's number in a dataset is its place here."""
+from dataset_convert.safe_pickle import load_object_array, parse_npy, read_index
+from lerobot_lansar.calvin import CAMERAS
 
 VECTORS = {"robot_obs": (15,), "scene_obs": (24,), "actions": (7,), "rel_actions": (7,)}
 """Shapes of the float vectors stored in every frame file."""
 
-CAMERAS = {"rgb_static": (200, 200, 3), "rgb_gripper": (84, 84, 3)}
+RGB = {f"rgb_{camera}": (size, size, 3) for camera, size in CAMERAS.items()}
 """Shapes of the uint8 pictures stored in a frame file, unless it was recorded without cameras."""
 
-DEPTH = {"depth_static": (200, 200), "depth_gripper": (84, 84)}
+DEPTH = {f"depth_{camera}": (size, size) for camera, size in CAMERAS.items()}
 """Shapes of the floating-point distances (m) of both cameras, in public data."""
 
 TACTILE = {"rgb_tactile": (160, 120, 6), "depth_tactile": (160, 120, 2)}
 """Shapes of the pictures of the two fingertip sensors side by side: uint8 colours, floating-point depth."""
 
-_SHAPES = VECTORS | CAMERAS | DEPTH | TACTILE
+_SHAPES = VECTORS | RGB | DEPTH | TACTILE
 
 _MOST_BYTES = 1 << 20
 """No array of a frame is half as large."""
@@ -69,186 +49,17 @@ _REPAIR = "download or record it again"
 _NO_PICTURES = "recorded without cameras? then use --images=none and no --embed"
 _NO_EXTRA = "not recorded? then leave out --depth and --tactile"
 
-_DTYPE = re.compile(r"b1|[iu][1248]|f[248]|[SU][1-9]\d*|O8?")
-"""How numpy names the dtypes that an index file may hold."""
-
-
-@dataclass
-class _Dtype:
-    """Stands in for ``numpy.dtype``: a kind, a size and a byte order; the rest of its state is ignored.
-
-    numpy believes a dtype's state whatever it says: with a size that does not fit it reads beyond its arrays.
-    """
-
-    name: Any
-    order: Any = "="
-
-    def __setstate__(self, state: Any) -> None:
-        self.order = state[1]
-
-    def numpy(self) -> np.dtype:
-        if not _DTYPE.fullmatch(self.name):
-            raise pickle.UnpicklingError(f"refused dtype {self.name!r}")
-        return np.dtype(self.name).newbyteorder(self.order)
-
-
-@dataclass
-class _Array:
-    """Stands in for an array: what the file says of it, not checked before the file is read to its end.
-
-    ``data`` are bytes, or for an array of objects the list of them in C order, whatever the array's own order.
-    """
-
-    shape: Any = None
-    dtype: Any = None
-    fortran_order: Any = None
-    data: Any = None
-
-    def __setstate__(self, state: Any) -> None:
-        _version, self.shape, self.dtype, self.fortran_order, self.data = state
-
-    def numpy(self, done: dict[int, Any]) -> np.ndarray:
-        """The array, its objects passed through :func:`_with_arrays`."""
-        dtype = self.dtype.numpy()
-        if not all(type(length) is int and length >= 0 for length in self.shape):
-            raise pickle.UnpicklingError(f"refused shape {self.shape!r}")
-        if dtype.hasobject:
-            objects = [_with_arrays(item, done) for item in self.data]
-            return np.fromiter(objects, dtype, len(objects)).reshape(self.shape)
-        array = np.frombuffer(self.data, dtype).copy()
-        if dtype.kind == "U":
-            array.tolist()  # numpy notices characters that do not exist only when a string is taken out
-        return array.reshape(self.shape, order="F" if self.fortran_order else "C")
-
-
-def _scalar(dtype: _Dtype, data: bytes) -> Any:
-    """Stands in for numpy's constructor of scalars, and makes Python's numbers and strings of them."""
-    return np.frombuffer(data, dtype.numpy()).item()
-
-
-def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> _Array:
-    """Stands in for the constructor with which pickle protocol 5 spells arrays."""
-    return _Array(shape, dtype, order == "F", data)
-
-
-def _encode_latin1(text: str, encoding: str) -> bytes:
-    """Stands in for ``codecs.encode``, with which pickle protocol 2 spells bytes."""
-    if encoding != "latin1":
-        raise pickle.UnpicklingError(f"refused encoding {encoding!r}")
-    return text.encode("latin1")
-
-
-# All that a file may name, before and after numpy 2 moved it, and what stands in for it. numpy's own constructors
-# believe their arguments and their state: a crafted file could read the process's memory through them, or crash it.
-_STAND_INS: dict[tuple[str, str], Any] = {
-    ("_codecs", "encode"): _encode_latin1,
-    ("__builtin__", "bytes"): lambda: b"",  # how protocol 2 spells no bytes
-    ("numpy", "ndarray"): None,  # only ever an argument of _reconstruct
-    ("numpy", "dtype"): lambda name, *_: _Dtype(name),
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): lambda *_: _Array() for core in ("core", "_core")},
-    **{(f"numpy.{core}.multiarray", "scalar"): _scalar for core in ("core", "_core")},
-    **{(f"numpy.{core}.numeric", "_frombuffer"): _from_buffer for core in ("core", "_core")},
-}
-
-
-class _ArrayUnpickler(pickle.Unpickler):
-    """Unpickles dicts, lists, tuples, strings, numbers and stand-ins for arrays, and refuses the rest."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _STAND_INS:
-            raise pickle.UnpicklingError(f"refused to load {module}.{name}")
-        return _STAND_INS[module, name]
-
-
-def _unpickle(content: bytes) -> Any:
-    """What a pickle holds, with arrays.
-
-    Raises:
-        Exception: nearly any, where the pickle is damaged or asks for anything but arrays, strings and numbers.
-    """
-    # The unpickler itself reserves memory for whatever sizes and places it reads; genops raises at a wrong size.
-    for opcode, argument, _ in pickletools.genops(content):
-        if opcode.name.endswith("PUT") and (argument or 0) > len(content):
-            raise pickle.UnpicklingError(f"refused place {argument} for an object")
-    return _with_arrays(_ArrayUnpickler(io.BytesIO(content)).load(), {})
-
-
-def _with_arrays(stored: Any, done: dict[int, Any]) -> Any:
-    """Copies containers with arrays in place of their stand-ins.
-
-    Args:
-        stored: what the unpickler returned, or a part of it.
-        done: the copies made so far, by the id of what was copied; what occurs often in the file is copied once.
-
-    Returns:
-        The copy, of dicts, lists, tuples, arrays, strings and numbers alone.
-
-    Raises:
-        pickle.UnpicklingError: there is anything else in it.
-        TypeError, ValueError: an array contradicts itself.
-        RecursionError: it is nested too deeply.
-    """
-    if stored is None or isinstance(stored, (str, bytes, int, float)):
-        return stored
-    if id(stored) in done:
-        return done[id(stored)]
-    copy: Any
-    if isinstance(stored, _Array):
-        copy = stored.numpy(done)
-    elif isinstance(stored, dict):
-        copy = {_with_arrays(key, done): _with_arrays(value, done) for key, value in stored.items()}
-    elif isinstance(stored, list):
-        copy = [_with_arrays(item, done) for item in stored]
-    elif isinstance(stored, tuple):
-        copy = tuple([_with_arrays(item, done) for item in stored])
-    else:
-        raise pickle.UnpicklingError(f"refused {type(stored).__name__}")
-    done[id(stored)] = copy
-    return copy
-
-
-def _read_index(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"{path} is missing: --root must hold a complete CALVIN split") from error
-
-
-def load_object_array(path: Path) -> Any:
-    """Loads the object stored in a 0-d object ``.npy`` file without running or believing anything in it.
-
-    Args:
-        path: a file written by ``numpy.save`` from a dict.
-
-    Returns:
-        The stored object: containers of arrays, strings and numbers; numpy's scalars become Python's.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        OSError: the machine cannot read it.
-        ValueError: it is not such a file, it is damaged, or it names anything but numpy arrays.
-    """
-    content = _read_index(path)
-    try:
-        header = _npy_header_of(content)
-        if not _parse_npy_header(header)[2].hasobject:
-            raise ValueError("holds no pickled object")
-        stored = _unpickle(content[len(header) :])
-        return stored.item() if isinstance(stored, np.ndarray) and stored.ndim == 0 else stored
-    except Exception as error:  # see _unpickle
-        raise ValueError(f"{path}: not an index file of arrays, strings and numbers ({error!r})") from error
-
 
 @dataclass(frozen=True)
 class Window:
-    """One annotated demonstration: frames ``start`` to ``end - 1`` of the split.
+    """One annotated demonstration: frames `start` to `end - 1` of the split.
 
     Attributes:
-        start: first frame number.
-        end: first frame number after the window (exclusive, a CALVIN fact that is easy to get wrong).
-        task: task name, such as ``open_drawer``.
-        sentence: the command in words.
-        scene: the scene's letter, such as ``D``.
+        start: First frame number.
+        end: First frame number after the window (exclusive, a CALVIN fact that is easy to get wrong).
+        task: Task name, such as `open_drawer`.
+        sentence: The command in words.
+        scene: The scene's letter, such as `D`.
     """
 
     start: int
@@ -265,17 +76,17 @@ class CalvinSplit:
     """The index of one split, read and checked once; frames are read on demand.
 
     Attributes:
-        root: the dataset's folder.
-        name: the split's name.
-        folder: the split's folder.
-        scenes: scene letter -> (first, last) frame, both inclusive.
-        windows: the annotated windows in the file's order.
+        root: The dataset's folder.
+        name: The split's name.
+        folder: The split's folder.
+        scenes: Scene letter -> (first, last) frame, both inclusive.
+        windows: The annotated windows in the file's order.
         recordings: (N, 2) first and last frame of each uninterrupted recording, in order.
-        source_sha256: hash of the index files, which identifies what was converted.
+        source_sha256: Hash of the index files, which identifies what was converted.
 
     Raises:
-        FileNotFoundError: the folder or one of its index files is missing.
-        ValueError: an index file is malformed, or a window lies outside every scene or recording.
+        FileNotFoundError: The folder or one of its index files is missing.
+        ValueError: An index file is malformed, or a window lies outside every scene or recording.
     """
 
     def __init__(self, root: Path, split: str):
@@ -311,16 +122,16 @@ class CalvinSplit:
         """Reads some arrays of some frames.
 
         Args:
-            frames: n frame numbers.
-            keys: names out of :data:`VECTORS`, :data:`CAMERAS`, :data:`DEPTH` and :data:`TACTILE`.
+            frames: N frame numbers.
+            keys: Names out of `VECTORS`, `RGB`, `DEPTH` and `TACTILE`.
 
         Returns:
             For each key an array of shape (n, …) in the file's floating dtype, or uint8 for colours.
 
         Raises:
-            FileNotFoundError: a frame's file is missing.
-            OSError: the machine cannot read a file, about which this says nothing.
-            ValueError: a file is truncated, or an array in it is missing or has a wrong shape or dtype; the
+            FileNotFoundError: A frame's file is missing.
+            OSError: The machine cannot read a file, about which this says nothing.
+            ValueError: A file is truncated, or an array in it is missing or has a wrong shape or dtype; the
                 message names the file and the key.
         """
         columns: dict[str, list[np.ndarray]] = {key: [] for key in keys}
@@ -344,7 +155,7 @@ def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
             members = stored.NameToInfo
             missing = [key for key in keys if f"{key}.npy" not in members]
             if not missing:
-                return {key: _parse_npy(_read_member(stored, members[f"{key}.npy"])) for key in keys}
+                return {key: parse_npy(_read_member(stored, members[f"{key}.npy"])) for key in keys}
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{path} is missing: the split is incomplete, {_REPAIR}") from error
     except MemoryError:
@@ -354,7 +165,7 @@ def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
         if isinstance(fault, OSError) and fault.errno != errno.EINVAL:  # EINVAL comes of a damaged offset
             raise OSError(fault.errno, fault.strerror, str(path)) from error
         raise ValueError(f"{path}: truncated or not an npz file ({error!r}); {_REPAIR}") from error
-    remedy = _NO_PICTURES if missing[0] in CAMERAS else _REPAIR if missing[0] in VECTORS else _NO_EXTRA
+    remedy = _NO_PICTURES if missing[0] in RGB else _REPAIR if missing[0] in VECTORS else _NO_EXTRA
     raise ValueError(f"{path}: array {missing[0]!r} is missing; {remedy}")
 
 
@@ -366,30 +177,6 @@ def _read_member(stored: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
         raise ValueError(f"{member.filename} is packed by method {member.compress_type}, not as numpy does")
     with stored.open(member) as file:
         return file.read(member.file_size)
-
-
-def _npy_header_of(content: bytes) -> bytes:
-    return content[: 10 + int.from_bytes(content[8:10], "little")]
-
-
-def _parse_npy(content: bytes) -> np.ndarray:
-    """What ``numpy.load`` does, 3 times faster for small arrays: all frames share a handful of headers."""
-    header = _npy_header_of(content)
-    shape, fortran_order, dtype = _parse_npy_header(header)
-    array = np.frombuffer(content, dtype, offset=len(header))
-    return array.reshape(shape, order="F" if fortran_order else "C")
-
-
-@lru_cache(maxsize=64)
-def _parse_npy_header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype]:
-    file = io.BytesIO(header)
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        raise ValueError(f"unknown npy version {version}")
-    try:
-        return np.lib.format.read_array_header_1_0(file)
-    except MemoryError as error:  # Python's parser, not the machine
-        raise ValueError("npy header is nested too deeply") from error
 
 
 def _checked(array: np.ndarray, key: str, path: Path) -> np.ndarray:
@@ -416,9 +203,9 @@ def _read_scenes(path: Path) -> dict[str, tuple[int, int]]:
 
 
 def _read_recordings(path: Path) -> np.ndarray:
-    content = _read_index(path)
+    content = read_index(path)
     try:
-        recordings = _parse_npy(content).reshape(-1, 2)
+        recordings = parse_npy(content).reshape(-1, 2)
         if recordings.dtype.kind not in "iu":
             raise ValueError(f"found {recordings.dtype}")
     except Exception as error:  # damaged bytes make numpy's header parser raise nearly anything

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dataset_convert.calvin import COLOURS
+from dataset_convert.layout import MANIFEST
+from lerobot_lansar.calvin import COLORS
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
@@ -43,7 +44,7 @@ def write(root: Path, repo_id: str) -> None:
 
 def fields(root: Path, repo_id: str) -> dict[str, Any]:
     """What LeRobot's card is told of a converted dataset."""
-    manifest = json.loads((root / "meta" / "calvin_source.json").read_text())
+    manifest = json.loads((root / MANIFEST).read_text())
     info = json.loads((root / "meta" / "info.json").read_text())
     clip = root / "clip" / "clip.json"
     return {
@@ -57,16 +58,14 @@ def fields(root: Path, repo_id: str) -> dict[str, Any]:
     }
 
 
-def describe(
-    manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any] | None, repo_id: str
-) -> str:
+def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
     """The description part of the card.
 
     Args:
-        manifest: what ``meta/calvin_source.json`` holds.
-        info: what ``meta/info.json`` holds.
-        clip: what ``clip/clip.json`` holds, if there are embeddings.
-        repo_id: the dataset's name.
+        manifest: What `meta/calvin_source.json` holds.
+        info: What `meta/info.json` holds.
+        clip: What `clip/clip.json` holds, if there are embeddings.
+        repo_id: The dataset's name.
 
     Returns:
         Markdown.
@@ -133,11 +132,7 @@ def _features(info: dict[str, Any], action: str) -> str:
 
 def _windows(manifest: dict[str, Any], used: list[dict[str, Any]]) -> str:
     request = manifest["request"]
-    kept = (
-        ""
-        if len(used) == len(manifest["windows"])
-        else f" {len(used)} of {len(manifest['windows'])} are here."
-    )
+    kept = "" if len(used) == len(manifest["windows"]) else f" {len(used)} of {len(manifest['windows'])} are here."
     if request["mode"] == "play":
         return f"{kept} Every frame of play is here once."
     if request["dedup"] == "none":
@@ -167,7 +162,7 @@ def _colours(manifest: dict[str, Any]) -> str:
     for letter, scene in manifest["scenes"].items():
         votes = np.array(manifest["block_votes"][letter])
         total += int(votes.sum())
-        for named, row in zip(COLOURS, votes.tolist(), strict=True):
+        for named, row in zip(COLORS, votes.tolist(), strict=True):
             for risen, count in zip(scene["block_order"], row, strict=True):
                 if count and risen != named:
                     wrong += count

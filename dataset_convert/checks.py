@@ -7,52 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_convert.calvin import COLOURS, VECTORS, CalvinSplit
+from dataset_convert.calvin import VECTORS, CalvinSplit
+from lerobot_lansar.calvin import (
+    BLOCK_ORDER,
+    BLOCKS,
+    COLORS,
+    FURNITURE,
+    TASKS,
+    block_pose,
+    relative_action,
+    wrap_angle,
+)
 
-POSITION_STEP = 0.02
-"""Metres that a relative action of 1 stands for."""
-
-ROTATION_STEP = 0.05
-"""Radians that a relative action of 1 stands for."""
-
-SCENE_BLOCK_ORDER = {
-    "A": ("pink", "blue", "red"),
-    "B": ("red", "blue", "pink"),
-    "C": ("blue", "red", "pink"),
-    "D": ("red", "blue", "pink"),
-}
-"""In which order the simulator writes the blocks into ``scene_obs``: that of each scene's configuration
-file."""
-
-_BLOCKS_START, _BLOCK_LENGTH = (
-    6,
-    6,
-)  # scene_obs: slide, drawer, button, switch, bulb, LED, then xyz + euler per block
 _LIFTED = 0.03  # m; the smallest rise that CALVIN's oracle counts as a lift (from the slider)
 _ACTION_TOLERANCE = 1e-4  # float32 rounding of an angle near pi is 5e-6 in units of a relative action
-
-
-def wrap_angle(angle: np.ndarray) -> np.ndarray:
-    """Brings angles (rad) into [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def relative_actions(actions: np.ndarray, robot_obs: np.ndarray) -> np.ndarray:
-    """The relative form of absolute actions, as the simulator defines it.
-
-    Position and euler differences to the current TCP pose, the latter wrapped to [-pi, pi) one by one,
-    divided by (0.02 m, 0.05 rad) and clipped to ±1; the gripper command unchanged.
-
-    Args:
-        actions: (n, 7) TCP xyz (m), euler xyz (rad), gripper ±1.
-        robot_obs: (n, 15) CALVIN's robot observation, TCP pose first.
-
-    Returns:
-        (n, 7) relative actions.
-    """
-    position = (actions[:, :3] - robot_obs[:, :3]) / POSITION_STEP
-    rotation = wrap_angle(actions[:, 3:6] - robot_obs[:, 3:6]) / ROTATION_STEP
-    return np.concatenate([np.clip(position, -1, 1), np.clip(rotation, -1, 1), actions[:, 6:]], axis=1)
 
 
 def check_frames(
@@ -64,14 +32,14 @@ def check_frames(
     """Checks frames; shapes and dtypes were checked when they were read.
 
     Args:
-        columns: the frames' vectors and, if any, distances, each (n, …); colours are left alone.
-        frames: their n numbers.
-        split: names the files.
-        limits: array -> smallest and largest distance (m) that its depth video can hold.
+        columns: The frames' vectors and, if any, distances, each (n, …); colours are left alone.
+        frames: Their n numbers.
+        split: Names the files.
+        limits: Array -> smallest and largest distance (m) that its depth video can hold.
 
     Raises:
-        ValueError: a number is not finite as float32, a distance does not fit into its video, a gripper command is
-            neither -1 nor 1, or a relative action is not what ``actions`` and ``robot_obs`` say it is; the message
+        ValueError: A number is not finite as float32, a distance does not fit into its video, a gripper command is
+            neither -1 nor 1, or a relative action is not what `actions` and `robot_obs` say it is; the message
             names the file.
     """
     limits = limits or {}
@@ -86,9 +54,7 @@ def check_frames(
             rows = column.reshape(len(column), -1).astype(np.float32, copy=False)
         bad = ~np.isfinite(rows).all(axis=1)
         if bad.any():
-            raise ValueError(
-                f"{file_of(bad.argmax())}: array {key!r} holds a number that is not finite in float32"
-            )
+            raise ValueError(f"{file_of(bad.argmax())}: array {key!r} holds a number that is not finite in float32")
         if key in limits:
             low, high = limits[key]
             nearest, farthest = rows.min(axis=1), rows.max(axis=1)
@@ -106,13 +72,13 @@ def check_frames(
         raise ValueError(f"{file_of(row)}: gripper command {gripper[row]:g} in 'actions', expected -1 or 1")
 
     actions, robot_obs, stored = columns["actions"], columns["robot_obs"], columns["rel_actions"]
-    wrong: np.ndarray = np.abs(stored - relative_actions(actions, robot_obs)) > _ACTION_TOLERANCE
+    wrong: np.ndarray = np.abs(stored - relative_action(actions, robot_obs)) > _ACTION_TOLERANCE
     # Half a turn is as far to the left as to the right: rounding decides the sign, so both are accepted.
     half_turn = np.abs(np.abs(wrap_angle(actions[:, 3:6] - robot_obs[:, 3:6])) - np.pi) < 1e-4
     wrong[:, 3:6] &= ~(half_turn & (np.abs(np.abs(stored[:, 3:6]) - 1) <= _ACTION_TOLERANCE))
     if wrong.any():
         row, axis = np.argwhere(wrong)[0]
-        expected = relative_actions(actions, robot_obs)[row, axis]
+        expected = relative_action(actions, robot_obs)[row, axis]
         raise ValueError(
             f"{file_of(row)}: rel_actions[{axis}] is {stored[row, axis]:.6f}, "
             f"but actions and robot_obs give {expected:.6f}"
@@ -120,34 +86,34 @@ def check_frames(
 
 
 def block_order(scene: str, votes: np.ndarray) -> tuple[str, ...]:
-    """Which colour each of the three block columns of ``scene_obs`` holds.
+    """Which colour each of the three block columns of `scene_obs` holds.
 
     The documentation says red, blue, pink; the simulator writes another order in scenes A and C. So the data
     decide: in a window that lifts the red block, the red column rises. The scene's known order serves where
     the data leave a choice, or say nothing.
 
     Args:
-        scene: the scene's letter.
+        scene: The scene's letter.
         votes: (3, 3) integers, how often block column j rose in windows that lift colour i of
-        :data:`COLOURS`.
+        `COLORS`.
 
     Returns:
         Three colours, the first being that of the first column.
 
     Raises:
-        ValueError: the scene is unknown and the data do not settle it, or no order explains at least 0.8 of the
+        ValueError: The scene is unknown and the data do not settle it, or no order explains at least 0.8 of the
             votes.
     """
-    known = SCENE_BLOCK_ORDER.get(scene)
-    orders = list(permutations(COLOURS))
-    scores = {order: sum(votes[COLOURS.index(c), j] for j, c in enumerate(order)) for order in orders}
+    known = BLOCK_ORDER.get(scene)
+    orders = list(permutations(COLORS))
+    scores = {order: sum(votes[COLORS.index(c), j] for j, c in enumerate(order)) for order in orders}
     best = max(scores.values())
     winners = [order for order, score in scores.items() if score == best]
     order = known if known in winners else winners[0] if len(winners) == 1 else None
     # A few public annotations name the wrong colour, hence a majority and not unanimity.
     if order is not None and best >= 0.8 * votes.sum():
         return order
-    evidence = "; ".join(f"lift_{c}: columns rose {votes[i].tolist()} times" for i, c in enumerate(COLOURS))
+    evidence = "; ".join(f"lift_{c}: columns rose {votes[i].tolist()} times" for i, c in enumerate(COLORS))
     raise ValueError(
         f"scene {scene}: cannot tell which block is in which column of scene_obs ({evidence}; known order: "
         f"{', '.join(known) if known else 'none'}); it needs agreeing lift_<colour>_… windows of two colours"
@@ -161,12 +127,12 @@ def block_votes(split: CalvinSplit, scene: str) -> np.ndarray:
     the window left out, then.
 
     Returns:
-        (3, 3) int64: row = colour named by the task in the order of :data:`COLOURS`, column = block column.
+        (3, 3) int64: row = colour named by the task in the order of `COLORS`, column = block column.
     """
     votes = np.zeros((3, 3), dtype=np.int64)
     for window in split.windows:
-        colour = window.task.removeprefix("lift_").partition("_")[0]
-        if window.scene != scene or not window.task.startswith("lift_") or colour not in COLOURS:
+        task = TASKS.get(window.task)
+        if window.scene != scene or task is None or task.kind != "lift_block" or task.color is None:
             continue
         ends = [window.start, window.end - 1]
         try:
@@ -174,9 +140,9 @@ def block_votes(split: CalvinSplit, scene: str) -> np.ndarray:
             check_frames(columns, ends, split)
         except (FileNotFoundError, ValueError):
             continue
-        rise = np.diff(columns["scene_obs"], axis=0)[0, _BLOCKS_START + 2 :: _BLOCK_LENGTH]
+        rise = np.diff(columns["scene_obs"], axis=0)[0, BLOCKS].reshape(3, 6)[:, 2]
         if rise.max() > _LIFTED:
-            votes[COLOURS.index(colour), rise.argmax()] += 1
+            votes[COLORS.index(task.color), rise.argmax()] += 1
     return votes
 
 
@@ -195,12 +161,11 @@ def reorder_blocks(scene_obs: np.ndarray, order: tuple[str, ...]) -> np.ndarray:
     """Puts the blocks into red, blue, pink order.
 
     Args:
-        scene_obs: (n, 24) with block columns in ``order``.
-        order: three colours.
+        scene_obs: (n, 24) with block columns in `order`.
+        order: Three colours.
 
     Returns:
-        (n, 24) in the order of :data:`COLOURS`.
+        (n, 24) in the order of `COLORS`.
     """
-    fixed, blocks = np.split(scene_obs, [_BLOCKS_START], axis=1)
-    by_column = np.split(blocks, 3, axis=1)
-    return np.concatenate([fixed, *(by_column[order.index(colour)] for colour in COLOURS)], axis=1)
+    columns = [*range(24)[FURNITURE], *(c for color in COLORS for c in range(24)[block_pose(order.index(color))])]
+    return np.take(scene_obs, columns, axis=1)  # in rows, whose sums do not depend on the order of columns

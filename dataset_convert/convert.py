@@ -1,9 +1,8 @@
-"""``lansar-convert``: a split of a CALVIN dataset becomes a LeRobotDataset v3."""
+"""`lansar-convert`: a split of a CALVIN dataset becomes a LeRobotDataset v3."""
 
 import json
 import os
-import shlex
-import subprocess
+import shutil
 import sys
 from bisect import bisect_left
 from dataclasses import asdict, dataclass, field, replace
@@ -11,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-from draccus.utils import DraccusException
 
-from dataset_convert import checks, publish
-from dataset_convert.calvin import CAMERAS, SCENES, TASKS, VECTORS, CalvinSplit
+from dataset_convert import checks
+from dataset_convert.calvin import RGB, VECTORS, CalvinSplit
+from dataset_convert.embed import ClipOptions, SourcePictures, embed, load_clip
 from dataset_convert.episodes import (
     DEDUP,
     MODES,
@@ -27,24 +26,19 @@ from dataset_convert.episodes import (
     window_of_frames,
     window_spans,
 )
-from dataset_convert.shards import Job, convert_shard, cut_into_shards, describe, frames_done
-from dataset_convert.writer import RGBEncoder
-from lerobot_lansar.executors import SlurmConfig, WorkerDied, check_executor, run_shards
+from dataset_convert.hub import folder_of, push
+from dataset_convert.layout import MANIFEST, RGBEncoder
+from dataset_convert.shards import DATASET, SHARDS, Job, convert_shard, cut_into_shards, describe, frames_done
+from lerobot_lansar.calvin import BLOCK_ORDER, SCENE_NAMES, TASKS
+from lerobot_lansar.command import CommandError, run_command
+from lerobot_lansar.jobs.executors import check_executor, run_shards
+from lerobot_lansar.jobs.staging import publish, staging
+from lerobot_lansar.jobs.work import SlurmConfig
 
 FRAMES_PER_SHARD = 8000
 """One parquet file and one mp4 per camera (about 30 MB) hold this many frames."""
 
 IMAGES = ("video", "png", "none")
-
-
-@dataclass
-class ClipOptions:
-    """Which CLIP embeds the pictures."""
-
-    # open_clip's model name
-    model: str = "ViT-B-32"
-    # open_clip's tag of the weights, or a weights file; empty: untrained
-    pretrained: str = "openai"
 
 
 @dataclass
@@ -146,60 +140,52 @@ class ConvertConfig:
         }
 
 
-def folder_of(repo_id: str, folder: Path | None) -> Path:
-    """A dataset's folder: the one given, or where LeRobot looks for a dataset of that name."""
-    if folder is not None:
-        return folder
-    from huggingface_hub.constants import HF_HOME
-
-    return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")) / repo_id
-
-
-class HubError(Exception):
+class HubError(CommandError):
     """The upload failed; the dataset is safe on disk."""
 
 
 def convert(config: ConvertConfig) -> Path:
-    """Converts a split; the dataset appears at ``config.target`` complete or not at all.
+    """Converts a split; the dataset appears at `config.target` complete or not at all.
 
     What is there of an interrupted conversion is used; what is finished is not done again.
 
     Args:
-        config: the command's options.
+        config: The command's options.
 
     Returns:
-        The dataset's folder. With ``executor="slurm"`` it appears when the jobs are done.
+        The dataset's folder. With `executor="slurm"` it appears when the jobs are done.
 
     Raises:
-        FileNotFoundError: files of the source are missing.
-        ValueError: an option or the source's content is wrong, or the target holds something else.
-        WorkerDied: a worker was killed; the same call goes on where it stopped.
-        HubError: the upload failed.
+        FileNotFoundError: Files of the source are missing.
+        ValueError: An option or the source's content is wrong, or the target holds something else.
+        WorkerDied: A worker was killed; the same call goes on where it stopped.
+        HubError: The upload failed.
     """
     config.check()
     config = replace(config, root=config.root.resolve(), output_dir=config.target.resolve())
     split = CalvinSplit(config.root, config.split)
     request = config.request(split)
     if _is_done(config.target, request):
-        kept = json.loads((config.target / "meta/calvin_source.json").read_text())["license"]
+        kept = json.loads((config.target / MANIFEST).read_text())["license"]
         if kept != config.license:  # no option is the default, which must not change what was published
             raise ValueError(
                 f"--license={config.license}: {config.target} was made with --license={kept}: repeat that, or change "
-                "`license` in its meta/calvin_source.json"
+                f"`license` in its {MANIFEST}"
             )
         print(f"{config.target} already holds this conversion", file=sys.stderr)
-        publish.tidy(config.target)
+        shutil.rmtree(staging_of(config.target), ignore_errors=True)
         _after(config, split)
         return config.target
     job, info, report = plan(config, split)
     _check_recorded(config, job)
     if config.embed:
-        from dataset_convert import embed
-
-        embed.load_clip(config.clip.model, config.clip.pretrained)
-    with publish.staging(config.target, request) as folder:
-        if config.executor == "slurm":
-            publish.mark_submitted(folder)
+        load_clip(config.clip.model, config.clip.pretrained)
+    folder = job.folder
+    with staging(folder, config.target, request, _has_shards, submitting=config.executor == "slurm"):
+        if config.target.exists() and any(config.target.iterdir()):
+            raise ValueError(f"another process has just written {config.target}")
+        for name in (DATASET, SHARDS):
+            (folder / name).mkdir(exist_ok=True)
         run_shards(
             (convert_shard, (job,)),
             len(job.shards),
@@ -216,13 +202,24 @@ def convert(config: ConvertConfig) -> Path:
     return config.target
 
 
+def staging_of(output_dir: Path) -> Path:
+    """Where a dataset is prepared: a hidden folder beside its place, on the same file system."""
+    return output_dir.parent / f".{output_dir.name}.incomplete"
+
+
+def _has_shards(folder: Path) -> bool:
+    """Whether a staging folder holds finished shards; without the dataset it is left by a run that was killed just
+    after it published."""
+    return (folder / DATASET).exists() and any((folder / SHARDS).glob("*.json"))
+
+
 def _check_recorded(config: ConvertConfig, job: Job) -> None:
     """Reads the first frame of an episode, so that pictures that were not recorded are reported at once.
 
     Raises:
-        FileNotFoundError, ValueError: it cannot be read; with ``skip_bad``: that of no episode can.
+        FileNotFoundError, ValueError: It cannot be read; with `skip_bad`: that of no episode can.
     """
-    arrays = dict.fromkeys([*VECTORS, *(CAMERAS if config.embed else ()), *job.arrays()])
+    arrays = dict.fromkeys([*VECTORS, *(RGB if config.embed else ()), *job.arrays()])
     first: Exception | None = None
     for span in job.spans:
         try:
@@ -242,17 +239,15 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
         The work, LeRobot's description of the dataset, and what to report in the manifest.
 
     Raises:
-        FileNotFoundError: frames are missing and ``skip_bad`` is off.
-        ValueError: the blocks' order is unclear, or nothing is left to convert.
+        FileNotFoundError: Frames are missing and `skip_bad` is off.
+        ValueError: The blocks' order is unclear, or nothing is left to convert.
     """
     shared = shared_frames(split) if config.split == "training" else []
     if shared:
         used = [f for f in shared if any(first <= f <= last for first, last in split.recordings)]
         what = "left out" if config.exclude_shared else "kept; --exclude_shared=true leaves them out"
         what = (
-            f"{len(used)} of them inside training's recordings, {what}"
-            if used
-            else "in no recording, so not converted"
+            f"{len(used)} of them inside training's recordings, {what}" if used else "in no recording, so not converted"
         )
         _say(f"frames {as_ranges(shared)} are in training and in validation: {what}")
     excluded = shared if config.exclude_shared else []
@@ -270,7 +265,7 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
     votes = {scene: checks.block_votes(split, scene) for scene in scenes}
     orders = {scene: checks.block_order(scene, votes[scene]) for scene in scenes}
     for scene, order in orders.items():
-        if order != checks.SCENE_BLOCK_ORDER.get(scene):
+        if order != BLOCK_ORDER.get(scene):
             _say(f"scene {scene}: block columns are {', '.join(order)}, as its lifts show")
     names = {window.task for window in split.windows}
     if config.task_in_state and not names <= set(TASKS):
@@ -284,7 +279,7 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
     info = features.empty_info(config.action, pictures, config.task_in_state)
     job = Job(
         split=split,
-        folder=publish.staging_of(config.target),
+        folder=staging_of(config.target),
         spans=spans,
         shards=cut_into_shards([len(span) for span in spans], FRAMES_PER_SHARD),
         layout=features.layout_of(info, pictures),
@@ -293,7 +288,7 @@ def plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str,
         block_orders=orders,
         tasks=_sentences(split, spans),
         task_names=[*TASKS, *sorted(names - set(TASKS))],
-        scene_names=[*SCENES, *sorted(set(scenes) - set(SCENES))],
+        scene_names=[*SCENE_NAMES, *sorted(set(scenes) - set(SCENE_NAMES))],
         skip_bad=config.skip_bad,
     )
     report = {
@@ -343,27 +338,25 @@ def conclude(
 
     manifest = finish.finish(job, info, config.rgb_encoder, request, report)
     card.write(job.dataset, config.repo_id)
-    publish.publish(job.folder, config.target)
+    publish(job.folder, job.dataset, config.target)
     for bad in manifest["left_out"][:20]:
         _say(f"left out: frames {bad['start']}-{bad['end'] - 1}: {bad['reason']}")
     if manifest["left_out"]:
-        _say(f"{len(manifest['left_out'])} defective episodes were left out; {finish.MANIFEST} lists them")
+        _say(f"{len(manifest['left_out'])} defective episodes were left out; {MANIFEST} lists them")
     _after(config, job.split)
 
 
 def _after(config: ConvertConfig, split: CalvinSplit) -> None:
     if config.embed:
-        from dataset_convert import card, embed
+        from dataset_convert import card
 
-        clip = embed.load_clip(config.clip.model, config.clip.pretrained)
-        pictures = embed.SourcePictures(split, config.target)
-        embed.embed(config.target, pictures, clip, config.clip, num_workers=config.workers - 1)
+        clip = load_clip(config.clip.model, config.clip.pretrained)
+        pictures = SourcePictures(split, config.target)
+        embed(config.target, pictures, clip, config.clip, num_workers=config.workers - 1)
         card.write(config.target, config.repo_id)
     if config.push_to_hub:
-        from dataset_convert import hub
-
         try:
-            hub.push(config.target, config.repo_id, config.private)
+            push(config.target, config.repo_id, config.private)
         except Exception as error:  # the network's errors are of many kinds
             raise HubError(
                 f"cannot upload {config.target}: {error}; the dataset is complete there, run this again to go on"
@@ -373,7 +366,7 @@ def _after(config: ConvertConfig, split: CalvinSplit) -> None:
 def _is_done(target: Path, request: dict[str, Any]) -> bool:
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return False
-    manifest = target / "meta" / "calvin_source.json"
+    manifest = target / MANIFEST
     if manifest.is_file() and json.loads(manifest.read_text())["request"] == request:
         return True
     what = "the result of another conversion" if manifest.is_file() else "something else"
@@ -391,30 +384,24 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def main() -> int:
-    """Runs the command; returns 0, 2 after an error the user can mend, or 130 after Ctrl-C."""
-    os.environ.setdefault("SVT_LOG", "1")  # errors only: the encoder prints 20 lines per file otherwise
-    try:
-        config = draccus.parse(ConvertConfig)
-        folder = convert(config)
-    except (OSError, ValueError, WorkerDied, HubError, DraccusException) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except subprocess.CalledProcessError as error:
-        print(f"error: {shlex.join(error.cmd)} failed: {error.stderr or error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on where it stopped", file=sys.stderr)
-        return 130
+@draccus.wrap()
+def run(config: ConvertConfig) -> None:
+    """Converts, and says where the dataset is."""
+    folder = convert(config)
     if config.executor == "slurm" and not folder.exists():
         print(f"submitted; {folder} appears when the jobs are done")
     else:
         print(f"dataset {config.repo_id} is at {folder}")
-    return 0
+
+
+def main() -> int:
+    """Entry point of `lansar-convert`."""
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: the encoder prints 20 lines per file otherwise
+    return run_command("lansar-convert", run, resumable=True)
 
 
 if __name__ == "__main__":
     # workers on other machines know these functions by their module's real name
-    from dataset_convert.convert import main as run
+    from dataset_convert.convert import main as run_main
 
-    sys.exit(run())
+    sys.exit(run_main())

@@ -21,10 +21,10 @@ class Span:
     """The frames of one episode-to-be.
 
     Attributes:
-        start: first frame number of the source.
-        end: first frame number after it.
-        scene: the scene's letter.
-        windows: numbers of the annotated windows inside, in the language file's order.
+        start: First frame number of the source.
+        end: First frame number after it.
+        scene: The scene's letter.
+        windows: Numbers of the annotated windows inside, in the language file's order.
     """
 
     start: int
@@ -42,24 +42,20 @@ def window_spans(windows: list[Window], dedup: str, excluded: Iterable[int]) -> 
     Windows of the public data are random cuts that overlap: on split D every frame occurs 1.58 times.
 
     Args:
-        windows: of the split.
+        windows: Of the split.
         dedup: "none" keeps all; "task" keeps as many as possible of which no two show the same task and share
             a frame; "frames" as many as possible of which no two share a frame at all.
-        excluded: frames that no episode may contain.
+        excluded: Frames that no episode may contain.
     """
     taboo = np.unique(np.fromiter(excluded, dtype=np.int64))
     inside = [np.searchsorted(taboo, w.end) > np.searchsorted(taboo, w.start) for w in windows]
     numbers = [number for number, is_excluded in enumerate(inside) if not is_excluded]
     if dedup != "none":
-        numbers = _without_overlap(
-            windows, numbers, lambda number: windows[number].task if dedup == "task" else None
-        )
+        numbers = _without_overlap(windows, numbers, lambda number: windows[number].task if dedup == "task" else None)
     return [Span(windows[n].start, windows[n].end, windows[n].scene, (n,)) for n in numbers]
 
 
-def _without_overlap(
-    windows: list[Window], numbers: list[int], group: Callable[[int], str | None]
-) -> list[int]:
+def _without_overlap(windows: list[Window], numbers: list[int], group: Callable[[int], str | None]) -> list[int]:
     """The largest choice in which no two of a group overlap: always take the one that ends first."""
     free_from: dict[str | None, int] = {}
     chosen = []
@@ -71,11 +67,11 @@ def _without_overlap(
 
 
 def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
-    """One episode per uninterrupted recording, cut where an excluded frame is and at :data:`MAX_FRAMES`, with its
+    """One episode per uninterrupted recording, cut where an excluded frame is and at `MAX_FRAMES`, with its
     windows.
 
     Raises:
-        ValueError: a recording lies in no scene.
+        ValueError: A recording lies in no scene.
     """
     taboo = sorted(set(excluded))
     starts = np.array([window.start for window in split.windows])
@@ -94,7 +90,7 @@ def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
 
 
 def _cut(start: int, end: int, starts: np.ndarray, ends: np.ndarray) -> int:
-    """Where an episode that begins at ``start`` ends: where no window is cut in two, if there is such a place."""
+    """Where an episode that begins at `start` ends: where no window is cut in two, if there is such a place."""
     if end - start <= MAX_FRAMES:
         return end
     latest = start + MAX_FRAMES
@@ -139,7 +135,7 @@ def missing_frames(spans: list[Span], present: np.ndarray) -> list[int]:
     """Frames that episodes need and the source lacks, sorted.
 
     Args:
-        spans: the episodes.
+        spans: The episodes.
         present: (n,) sorted frame numbers of the source.
     """
     if not spans:
@@ -152,7 +148,7 @@ def missing_frames(spans: list[Span], present: np.ndarray) -> list[int]:
 
 
 def as_ranges(frames: list[int]) -> str:
-    """Frame numbers in a few words: ``5, 8-11, 20``."""
+    """Frame numbers in a few words: `5, 8-11, 20`."""
     numbers = np.array(sorted(frames))
     parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1) if frames else []
     words = [str(part[0]) if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts]

@@ -1,5 +1,6 @@
 """What a converted dataset looks like to LeRobot: its features, its videos' codecs, the files that describe it."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,11 @@ from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, Datase
 from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from dataset_convert.calvin import CAMERAS, COLOURS, DEPTH, FPS, TACTILE, TASKS
-from dataset_convert.writer import Codec, Layout, Picture, RGBEncoder, Stats
+from dataset_convert.calvin import DEPTH, RGB, TACTILE
+from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder
+from dataset_convert.stats import Stats
+from lerobot_lansar.calvin import ACTION_NAMES, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
 
-_REL_NAMES = ["delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper"]
-_ABS_NAMES = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
-_STATE_NAMES = [
-    *("tcp_x", "tcp_y", "tcp_z", "tcp_roll", "tcp_pitch", "tcp_yaw", "gripper_width"),
-    *(f"joint_{i}" for i in range(1, 8)),
-    "gripper_action",
-]
-_SCENE_NAMES = ["slider", "drawer", "button", "switch", "lightbulb", "led"] + [
-    f"{colour}_block_{axis}" for colour in COLOURS for axis in ("x", "y", "z", "roll", "pitch", "yaw")
-]
 _TASK_NAMES = [f"task_{task}" for task in TASKS]
 _NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
 
@@ -35,9 +28,9 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
 
     Args:
         images: "video", "png" or "none".
-        depth: both cameras' distances too.
-        tactile: the fingertip sensors too. Their depth, fractions of a millimetre, is always stored exactly.
-        encoder: of the colour videos.
+        depth: Both cameras' distances too.
+        tactile: The fingertip sensors too. Their depth, fractions of a millimetre, is always stored exactly.
+        encoder: Of the colour videos.
 
     Raises:
         ValueError: LeRobot cannot encode like this here.
@@ -48,13 +41,11 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
     colours, distances = (_rgb_codec(encoder), _depth_codec()) if video else (None, None)
     found = [
         Picture(f"observation.images.{array.removeprefix('rgb_')}", array, slice(None), shape, colours)
-        for array, shape in CAMERAS.items()
+        for array, shape in RGB.items()
     ]
     if depth:
         found += [
-            Picture(
-                f"observation.images.{array.removeprefix('depth_')}_depth", array, 0, (*shape, 1), distances
-            )
+            Picture(f"observation.images.{array.removeprefix('depth_')}_depth", array, 0, (*shape, 1), distances)
             for array, shape in DEPTH.items()
         ]
     if tactile:
@@ -69,9 +60,7 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
 
 def _rgb_config(encoder: RGBEncoder) -> RGBEncoderConfig:
     try:
-        return RGBEncoderConfig(
-            vcodec=encoder.vcodec, crf=encoder.crf, preset=encoder.preset or None, g=encoder.g
-        )
+        return RGBEncoderConfig(vcodec=encoder.vcodec, crf=encoder.crf, preset=encoder.preset or None, g=encoder.g)
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"--rgb_encoder.vcodec={encoder.vcodec}: {error}") from error
 
@@ -84,36 +73,33 @@ def _rgb_codec(encoder: RGBEncoder) -> Codec:
 
 def _depth_codec() -> Codec:
     config = DepthEncoderConfig()
-    quantizer = {
-        name: getattr(config, name) for name in ("depth_min", "depth_max", "shift", "use_log", "pix_fmt")
-    }
+    quantizer = {name: getattr(config, name) for name in ("depth_min", "depth_max", "shift", "use_log", "pix_fmt")}
     return Codec(config.vcodec, config.pix_fmt, config.get_codec_options(1, as_strings=True), quantizer)
 
 
-def dataset_features(
-    action: str, pictures: tuple[Picture, ...], task_in_state: bool = False
-) -> dict[str, dict]:
+def dataset_features(action: str, pictures: tuple[Picture, ...], task_in_state: bool = False) -> dict[str, dict]:
     """LeRobot's description of the dataset's columns.
 
     Args:
-        action: "rel" or "abs", the form that ``action`` holds; the other one is kept as ``calvin.…``, a name that
+        action: "rel" or "abs", the form that `action` holds; the other one is kept as `calvin.…`, a name that
             LeRobot does not take for something a policy should predict.
-        pictures: camera features.
-        task_in_state: the scene's state also says which task is commanded.
+        pictures: Camera features.
+        task_in_state: The scene's state also says which task is commanded.
 
     Returns:
-        Feature name -> {"dtype", "shape", "names"}, LeRobot's own columns (``index``, …) included.
+        Feature name -> {"dtype", "shape", "names"}, LeRobot's own columns (`index`, …) included.
     """
 
-    def vector(names: list[str]) -> dict:
+    def vector(names: Iterable[str]) -> dict:
+        names = list(names)
         return {"dtype": "float32", "shape": (len(names),), "names": names}
 
-    other = "calvin.actions" if action == "rel" else "calvin.rel_actions"
+    other, other_form = ("calvin.actions", "abs") if action == "rel" else ("calvin.rel_actions", "rel")
     features = {
-        "observation.state": vector(_STATE_NAMES),
-        "observation.environment_state": vector([*_SCENE_NAMES, *(_TASK_NAMES if task_in_state else ())]),
-        "action": vector(_REL_NAMES if action == "rel" else _ABS_NAMES),
-        other: vector(_ABS_NAMES if action == "rel" else _REL_NAMES),
+        "observation.state": vector(ROBOT_OBS_NAMES),
+        "observation.environment_state": vector([*SCENE_OBS_NAMES, *(_TASK_NAMES if task_in_state else ())]),
+        "action": vector(ACTION_NAMES[action]),
+        other: vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
     }
     for picture in pictures:
@@ -131,7 +117,7 @@ def empty_info(action: str, pictures: tuple[Picture, ...], task_in_state: bool) 
     """The dataset's description before anything was written."""
     has_videos = any(picture.codec for picture in pictures)
     return create_empty_dataset_info(
-        CODEBASE_VERSION, FPS, dataset_features(action, pictures, task_in_state), has_videos, "panda"
+        CODEBASE_VERSION, CONTROL_HZ, dataset_features(action, pictures, task_in_state), has_videos, "panda"
     )
 
 
@@ -142,7 +128,7 @@ def layout_of(info: DatasetInfo, pictures: tuple[Picture, ...]) -> Layout:
 
 
 def merge_stats(stats: list[Stats]) -> Stats:
-    """LeRobot's ``aggregate_stats`` in the order of the first item; its own order differs from run to run."""
+    """LeRobot's `aggregate_stats` in the order of the first item; its own order differs from run to run."""
     merged = aggregate_stats(stats)
     return {key: merged[key] for key in stats[0]}
 
@@ -161,14 +147,14 @@ def write_whole(
     """Writes the files that describe the whole dataset, after all shards.
 
     Args:
-        root: the dataset's folder.
-        info: of :func:`empty_info`; its counters and its videos' properties are filled in.
-        layout: of the frames.
-        encoder: that the colour videos were made with.
-        first_shard: number of a shard that exists.
-        tasks: the sentences in the order of their numbers.
-        episodes, frames: how many there are.
-        stats: of all frames.
+        root: The dataset's folder.
+        info: Of `empty_info`; its counters and its videos' properties are filled in.
+        layout: Of the frames.
+        encoder: That the colour videos were made with.
+        first_shard: Number of a shard that exists.
+        tasks: The sentences in the order of their numbers.
+        episodes, frames: How many there are.
+        stats: Of all frames.
     """
     for picture in layout.pictures:
         if picture.codec:

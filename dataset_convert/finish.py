@@ -11,31 +11,29 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dataset_convert import features
-from dataset_convert.shards import Job, describe, sha256
-from dataset_convert.writer import Stats
-
-MANIFEST = Path("meta") / "calvin_source.json"
+from dataset_convert.layout import MANIFEST, RGBEncoder
+from dataset_convert.shards import Job, describe
+from dataset_convert.stats import Stats
+from lerobot_lansar.clip.store import sha256
 
 _EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
-def finish(
-    job: Job, info: Any, encoder: features.RGBEncoder, request: dict[str, Any], report: dict[str, Any]
-) -> dict[str, Any]:
+def finish(job: Job, info: Any, encoder: RGBEncoder, request: dict[str, Any], report: dict[str, Any]) -> dict[str, Any]:
     """Writes what describes the whole dataset, in the staging folder, after all shards; may be done again.
 
     Args:
-        job: whose shards are all written.
+        job: Whose shards are all written.
         info: LeRobot's description.
-        encoder: of the colour videos.
-        request: what was asked for.
-        report: what else the manifest should say; ``left_out`` is completed here.
+        encoder: Of the colour videos.
+        request: What was asked for.
+        report: What else the manifest should say; `left_out` is completed here.
 
     Returns:
-        The manifest, as written to ``meta/calvin_source.json``.
+        The manifest, as written to `meta/calvin_source.json`.
 
     Raises:
-        ValueError: every episode was left out.
+        ValueError: Every episode was left out.
     """
     episodes, frames, first_shard = 0, 0, None
     files: dict[str, str] = {}
@@ -83,9 +81,7 @@ def finish(
     orders = job.block_orders.items()
     manifest = {
         "request": request,
-        "scenes": {
-            s: {"frames": list(job.split.scenes[s]), "block_order": list(order)} for s, order in orders
-        },
+        "scenes": {s: {"frames": list(job.split.scenes[s]), "block_order": list(order)} for s, order in orders},
         "task_names": job.task_names,
         "scene_names": job.scene_names,
         "versions": {name: version(name) for name in ("lerobot_policy_lansar", "lerobot", "numpy", "av")},
@@ -144,9 +140,7 @@ def _renumber_frames(path: Path, first_episode: int, first_index: int) -> None:
             }
             for name, values in numbers.items():
                 field = table.schema.field(name)
-                table = table.set_column(
-                    table.schema.get_field_index(name), field, pa.array(values, field.type)
-                )
+                table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))
             target.write_table(table)
             index += len(old)
     partial.rename(path)

@@ -1,25 +1,34 @@
 """A converted dataset on the Hugging Face hub: uploading it, and finding what LeRobot has downloaded."""
 
+import os
 from pathlib import Path
 
+from huggingface_hub.constants import HF_HOME
+
 from dataset_convert import card
-from dataset_convert.convert import folder_of
 
 VERSION = "v3.0"
 """LeRobot's tag of the dataset format, by which it asks the hub for a dataset."""
+
+
+def folder_of(repo_id: str, folder: Path | None) -> Path:
+    """A dataset's folder: the one given, or where LeRobot looks for a dataset of that name."""
+    if folder is not None:
+        return folder
+    return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")) / repo_id
 
 
 def push(root: Path, repo_id: str, private: bool) -> None:
     """Uploads a dataset with LeRobot's own method, which also sets the version tag that loading needs.
 
     An interrupted upload goes on: what the hub has is not sent again. Large folders need no other method:
-    ``upload_folder``, which LeRobot calls, commits them in several parts and goes on where it stopped, and the hub's
-    client deprecates ``upload_large_folder`` in favour of it. The version tag is set last, so that nobody loads a part.
+    `upload_folder`, which LeRobot calls, commits them in several parts and goes on where it stopped, and the hub's
+    client deprecates `upload_large_folder` in favour of it. The version tag is set last, so that nobody loads a part.
 
     Args:
-        root: the dataset's folder.
+        root: The dataset's folder.
         repo_id: user/name.
-        private: whether only its owner sees it.
+        private: Whether only its owner sees it.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -30,15 +39,15 @@ def push(root: Path, repo_id: str, private: bool) -> None:
 def find_dataset(repo_id: str, folder: Path | None) -> Path:
     """A dataset's folder: the one given, or where LeRobot 0.6 would read that name from without asking the hub.
 
-    That is ``$HF_LEROBOT_HOME/<repo_id>``, unless it lacks the dataset or is a download of an earlier LeRobot; then
-    the snapshot of LeRobot's version tag in the download cache ``$HF_LEROBOT_HOME/hub``.
+    That is `$HF_LEROBOT_HOME/<repo_id>`, unless it lacks the dataset or is a download of an earlier LeRobot; then
+    the snapshot of LeRobot's version tag in the download cache `$HF_LEROBOT_HOME/hub`.
 
     Args:
         repo_id: user/name.
-        folder: given by the user; whether a dataset is in it is for the caller to see.
+        folder: Given by the user; whether a dataset is in it is for the caller to see.
 
     Raises:
-        FileNotFoundError: no folder is given and there is neither.
+        FileNotFoundError: No folder is given and there is neither.
     """
     if folder is not None:
         return folder
@@ -50,9 +59,7 @@ def find_dataset(repo_id: str, folder: Path | None) -> Path:
         return own
     try:
         return Path(
-            snapshot_download(
-                repo_id, repo_type="dataset", revision=VERSION, cache_dir=cache, local_files_only=True
-            )
+            snapshot_download(repo_id, repo_type="dataset", revision=VERSION, cache_dir=cache, local_files_only=True)
         )
     except (LocalEntryNotFoundError, ValueError) as error:  # no such download; no name that the hub can have
         raise FileNotFoundError(

@@ -1,6 +1,5 @@
 """The conversion's work: shards of episodes that can be written anywhere, in any order, and again."""
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,10 +10,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_convert import checks, publish
-from dataset_convert.calvin import TASKS, VECTORS, CalvinSplit
+from dataset_convert import checks
+from dataset_convert.calvin import VECTORS, CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
-from dataset_convert.writer import Block, Layout, Place, Written, digest, write_shard
+from dataset_convert.layout import Layout
+from dataset_convert.writer import Block, Place, Written, digest, write_shard
+from lerobot_lansar.calvin import TASKS
+from lerobot_lansar.clip.store import sha256
+from lerobot_lansar.jobs.staging import write_atomically
+
+DATASET, SHARDS = "dataset", "shards"
+"""Folders in a staging folder: what will be published, and one note per finished shard."""
 
 BLOCK = 256
 """Frames read at a time."""
@@ -25,16 +31,16 @@ class Job:
     """Everything that a shard's work needs; it is sent to every worker.
 
     Attributes:
-        split: the source.
-        folder: the staging folder.
-        spans: the episodes in order.
+        split: The source.
+        folder: The staging folder.
+        spans: The episodes in order.
         shards: (first, end) of each shard's episodes.
-        layout: of the files.
+        layout: Of the files.
         action: "rel" or "abs".
-        block_orders: scene -> colours of its block columns.
-        tasks: sentences in the order of their numbers.
-        task_names, scene_names: what the numbers in ``calvin.task`` and ``calvin.scene`` mean.
-        skip_bad: leave defective episodes out instead of stopping.
+        block_orders: Scene -> colours of its block columns.
+        tasks: Sentences in the order of their numbers.
+        task_names, scene_names: What the numbers in `calvin.task` and `calvin.scene` mean.
+        skip_bad: Leave defective episodes out instead of stopping.
     """
 
     split: CalvinSplit
@@ -53,11 +59,11 @@ class Job:
     @property
     def dataset(self) -> Path:
         """The folder that will be published."""
-        return self.folder / publish.DATASET
+        return self.folder / DATASET
 
     def note(self, shard: int) -> Path:
         """What a finished shard says of itself; the table of its episodes is beside it."""
-        return self.folder / publish.SHARDS / f"{shard:06d}.json"
+        return self.folder / SHARDS / f"{shard:06d}.json"
 
     def arrays(self) -> list[str]:
         """CALVIN's picture arrays that are needed."""
@@ -77,8 +83,8 @@ class BadEpisode(Exception):
     """An episode of the source is defective.
 
     Attributes:
-        number: its number among the job's spans.
-        reason: the error it gave.
+        number: Its number among the job's spans.
+        reason: The error it gave.
     """
 
     def __init__(self, number: int, reason: Exception):
@@ -92,9 +98,9 @@ def cut_into_shards(lengths: list[int], most: int, least: int = 16) -> list[tupl
     The cut depends on the episodes alone, so the files are the same for any number of workers.
 
     Args:
-        lengths: frames of each episode.
-        most: frames that a shard should hold at most, when there are many.
-        least: shards that there should be at least, when there are few episodes.
+        lengths: Frames of each episode.
+        most: Frames that a shard should hold at most, when there are many.
+        least: Shards that there should be at least, when there are few episodes.
     """
     size = min(most, -(-sum(lengths) // least))
     shards, first, frames = [], 0, 0
@@ -110,7 +116,7 @@ def convert_shard(job: Job, shard: int) -> None:
     """Writes one shard, unless it is there already.
 
     Raises:
-        FileNotFoundError, ValueError: the source is defective and ``skip_bad`` is off.
+        FileNotFoundError, ValueError: The source is defective and `skip_bad` is off.
     """
     note = job.note(shard)
     if note.exists() and _is_intact(job, note):
@@ -130,9 +136,7 @@ def convert_shard(job: Job, shard: int) -> None:
     while True:
         progress = _Progress(note.with_suffix(".count"))
         hashes: list[str] = []
-        episodes = (
-            (len(job.spans[n]), _hashed(job, n, progress, hashes)) for n in range(first, end) if n not in bad
-        )
+        episodes = ((len(job.spans[n]), _hashed(job, n, progress, hashes)) for n in range(first, end) if n not in bad)
         try:
             written = write_shard(job.dataset, job.layout, place, episodes, job.tasks)
             break
@@ -151,13 +155,11 @@ def convert_shard(job: Job, shard: int) -> None:
         "left_out": [describe(job.spans[number]) | {"reason": reason} for number, reason in bad.items()],
         "files": {name: sha256(job.dataset / name) for name in job.layout.files(shard)} if kept else {},
     }
-    partial = note.with_suffix(".partial")
-    partial.write_text(json.dumps(content))
-    partial.rename(note)
+    write_atomically(note, json.dumps(content))
 
 
 def _hashed(job: Job, number: int, progress: "_Progress", hashes: list[str]) -> Iterator[Block]:
-    """An episode's blocks; its hash is added to ``hashes`` after the last one."""
+    """An episode's blocks; its hash is added to `hashes` after the last one."""
     state = None
     for block, arrays in _blocks(job, number, with_pictures=True):
         state = digest(arrays, state)
@@ -171,7 +173,7 @@ def _blocks(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[Block,
     """An episode's blocks with the source's arrays as they were read.
 
     Raises:
-        BadEpisode: the source is defective.
+        BadEpisode: The source is defective.
     """
     span = job.spans[number]
     windows = window_of_frames(span, job.split.windows)
@@ -187,15 +189,13 @@ def _blocks(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[Block,
         yield to_block(job, span, frames, here, arrays), arrays
 
 
-def to_block(
-    job: Job, span: Span, frames: range, windows: np.ndarray, arrays: dict[str, np.ndarray]
-) -> Block:
+def to_block(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: dict[str, np.ndarray]) -> Block:
     """A block of source frames as the dataset holds it.
 
     Args:
-        job: what to make of them.
-        span: their episode.
-        frames: their numbers.
+        job: What to make of them.
+        span: Their episode.
+        frames: Their numbers.
         windows: (n,) the window each belongs to, or -1.
         arrays: CALVIN's arrays.
     """
@@ -241,7 +241,7 @@ class _Progress:
 
 def frames_done(folder: Path) -> int:
     """Of all shards in a staging folder."""
-    return sum(int(file.read_text() or 0) for file in (folder / publish.SHARDS).glob("*.count"))
+    return sum(int(file.read_text() or 0) for file in (folder / SHARDS).glob("*.count"))
 
 
 def _is_intact(job: Job, note: Path) -> bool:
@@ -250,12 +250,6 @@ def _is_intact(job: Job, note: Path) -> bool:
     table = note.with_suffix(".parquet")
     files = {job.dataset / name: sha for name, sha in content["files"].items()}
     return table.exists() and all(path.exists() and sha256(path) == sha for path, sha in files.items())
-
-
-def sha256(path: Path) -> str:
-    """A file's hash."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def describe(span: Span) -> dict[str, Any]:

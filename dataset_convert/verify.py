@@ -1,4 +1,4 @@
-"""``lansar-verify``: compares a converted dataset with its source, frame by frame."""
+"""`lansar-verify`: compares a converted dataset with its source, frame by frame."""
 
 import io
 import json
@@ -14,12 +14,11 @@ import av
 import draccus
 import numpy as np
 import pyarrow.parquet as pq
-from draccus.utils import DraccusException
 from PIL import Image
 from tqdm import tqdm
 
 from dataset_convert import checks
-from dataset_convert.calvin import CAMERAS, DEPTH, FPS, SCENES, TACTILE, TASKS, VECTORS, CalvinSplit
+from dataset_convert.calvin import DEPTH, RGB, TACTILE, VECTORS, CalvinSplit
 from dataset_convert.episodes import (
     NO_COMMAND,
     Span,
@@ -30,10 +29,12 @@ from dataset_convert.episodes import (
     window_spans,
 )
 from dataset_convert.hub import find_dataset
-from dataset_convert.shards import sha256
+from dataset_convert.layout import MANIFEST
 from dataset_convert.writer import digest
+from lerobot_lansar.calvin import COLORS, CONTROL_HZ, SCENE_NAMES, TASKS
+from lerobot_lansar.clip.store import dataset_fingerprint, sha256
+from lerobot_lansar.command import run_command
 
-_MANIFEST = "meta/calvin_source.json"  # dataset_convert.finish, which has it too, imports LeRobot
 _BETTER = 0.9  # of the squared error; a video of the desk that is a frame off has more than twice that of a right one
 
 
@@ -62,9 +63,9 @@ class Found:
     """What one file of frames holds.
 
     Attributes:
-        frames: how many.
-        psnr: feature -> signal-to-noise ratio (dB) of each picture.
-        sums: feature -> (smallest, largest, sum) of each dimension.
+        frames: How many.
+        psnr: Feature -> signal-to-noise ratio (dB) of each picture.
+        sums: Feature -> (smallest, largest, sum) of each dimension.
     """
 
     frames: int = 0
@@ -76,24 +77,24 @@ class Dataset:
     """What a converted dataset says of itself, beside its source.
 
     Attributes:
-        folder, info, manifest, tasks, sentence: the dataset's.
-        split: the source.
-        spans: its episodes in the source, as the manifest lists them.
-        windows: per episode the window of each frame.
-        orders: scene -> colours of its block columns, established from the source again.
+        folder, info, manifest, tasks, sentence: The dataset's.
+        split: The source.
+        spans: Its episodes in the source, as the manifest lists them.
+        windows: Per episode the window of each frame.
+        orders: Scene -> colours of its block columns, established from the source again.
 
     Raises:
-        FileNotFoundError: it is no dataset of ``lansar-convert``.
-        Mismatch: it was made from another source, or its files were changed since.
+        FileNotFoundError: It is no dataset of `lansar-convert`.
+        Mismatch: It was made from another source, or its files were changed since.
     """
 
     def __init__(self, folder: Path, root: Path):
-        if not (folder / _MANIFEST).is_file():
+        if not (folder / MANIFEST).is_file():
             raise FileNotFoundError(
-                f"{folder / _MANIFEST} is missing: --dataset_dir must hold a result of lansar-convert"
+                f"{folder / MANIFEST} is missing: --dataset_dir must hold a result of lansar-convert"
             )
         self.folder = folder
-        self.manifest = json.loads((folder / _MANIFEST).read_text())
+        self.manifest = json.loads((folder / MANIFEST).read_text())
         self.split = CalvinSplit(root, self.manifest["request"]["split"])
         if self.split.source_sha256 != self.manifest["request"]["source_sha256"]:
             raise Mismatch(f"{self.split.folder}: its index files are not those that {folder} was made from")
@@ -118,7 +119,7 @@ class Dataset:
                 else ("rgb_tactile", slice(3 * finger, 3 * finger + 3))
             )
         array = f"depth_{name.removesuffix('_depth')}" if name.endswith("_depth") else f"rgb_{name}"
-        assert array in CAMERAS | DEPTH | TACTILE, feature
+        assert array in RGB | DEPTH | TACTILE, feature
         return array, slice(None)
 
 
@@ -133,9 +134,9 @@ def verify(config: VerifyConfig) -> str:
         A few lines that say what was compared.
 
     Raises:
-        FileNotFoundError: files of one of them are missing.
-        Mismatch: they differ; the message says where.
-        ValueError: the source is defective.
+        FileNotFoundError: Files of one of them are missing.
+        Mismatch: They differ; the message says where.
+        ValueError: The source is defective.
     """
     folder = find_dataset(config.repo_id, config.dataset_dir)
     dataset = Dataset(folder, config.root)
@@ -159,9 +160,7 @@ def verify(config: VerifyConfig) -> str:
                 before = sums.get(key, (low, high, 0))
                 sums[key] = np.minimum(before[0], low), np.maximum(before[1], high), before[2] + total
     if frames != dataset.info["total_frames"]:
-        raise Mismatch(
-            f"{folder}/data holds {frames} frames, meta/info.json says {dataset.info['total_frames']}"
-        )
+        raise Mismatch(f"{folder}/data holds {frames} frames, meta/info.json says {dataset.info['total_frames']}")
     _check_stats(dataset, sums, frames)
     lines = [
         f"{folder}: {len(dataset.spans)} episodes, {frames} frames equal {dataset.split.folder}: state, scene and both "
@@ -170,9 +169,7 @@ def verify(config: VerifyConfig) -> str:
     ]
     for key, feature in dataset.info["features"].items():
         if key in psnr:
-            lines.append(
-                f"{key}: video, PSNR {np.mean(psnr[key]):.1f} dB on average, {np.min(psnr[key]):.1f} at worst"
-            )
+            lines.append(f"{key}: video, PSNR {np.mean(psnr[key]):.1f} dB on average, {np.min(psnr[key]):.1f} at worst")
         elif feature["dtype"] == "image":
             lines.append(f"{key}: equal, pixel by pixel")
     return "\n".join(lines + clip)
@@ -196,17 +193,17 @@ def _check_manifest(dataset: Dataset) -> None:
     for name, told, found in (
         ("windows", manifest["windows"], [asdict(window) for window in split.windows]),
         ("task_names", manifest["task_names"][: len(TASKS)], list(TASKS)),
-        ("scene_names", manifest["scene_names"][: len(SCENES)], list(SCENES)),
+        ("scene_names", manifest["scene_names"][: len(SCENE_NAMES)], list(SCENE_NAMES)),
         ("scenes", manifest["scenes"], scenes),
     ):
         if told != found:
             what = f"{told}, {found}" if name == "scenes" else "something else"
-            raise Mismatch(f"{dataset.folder}/{_MANIFEST}: {name} are not what {split.folder} says: {what}")
+            raise Mismatch(f"{dataset.folder}/{MANIFEST}: {name} are not what {split.folder} says: {what}")
     if manifest["request"]["split"] == "training":
         shared = shared_frames(split)
         if shared and shared != manifest["shared_frames"]:  # none: the source has no validation/ here
             raise Mismatch(
-                f"{dataset.folder}/{_MANIFEST}: training and validation share frames {as_ranges(shared)}, it says "
+                f"{dataset.folder}/{MANIFEST}: training and validation share frames {as_ranges(shared)}, it says "
                 f"{as_ranges(manifest['shared_frames']) or 'none'}"
             )
 
@@ -221,7 +218,7 @@ def _check_spans(dataset: Dataset) -> None:
     else:
         wanted = window_spans(split.windows, request["dedup"], excluded)
     left_out = [_span(e) for e in manifest["left_out"]]
-    place = f"{dataset.folder}/{_MANIFEST}"
+    place = f"{dataset.folder}/{MANIFEST}"
     if left_out and not request["skip_bad"]:
         raise Mismatch(f"{place}: {len(left_out)} episodes were left out without --skip_bad=true")
     listed, known = {*dataset.spans, *left_out}, set(wanted)
@@ -244,7 +241,7 @@ def _check_files(folder: Path, listed: dict[str, str]) -> None:
         for path in (folder / part).rglob("*")
         if path.is_file()
     }
-    _check_hashes(folder, there - {_MANIFEST}, listed, "was converted")
+    _check_hashes(folder, there - {MANIFEST}, listed, "was converted")
 
 
 def _check_hashes(folder: Path, there: set[str], listed: dict[str, str], since: str) -> None:
@@ -262,8 +259,6 @@ def _check_clip(dataset: Dataset) -> list[str]:
     folder = dataset.folder / "clip"
     if not folder.exists():
         return []
-    from lerobot_lansar.policy.frames import dataset_fingerprint
-
     if not (folder / "clip.json").is_file():
         raise Mismatch(f"{folder} holds no clip.json: delete that folder and run lansar-embed")
     told = json.loads((folder / "clip.json").read_text())
@@ -271,9 +266,7 @@ def _check_clip(dataset: Dataset) -> list[str]:
     _check_hashes(folder, there, told.get("files", {}), "was embedded")
     if told["fingerprint"] != dataset_fingerprint(dataset.folder):
         raise Mismatch(f"{folder} holds embeddings of other frames: delete that folder and run lansar-embed")
-    return [
-        f"{folder.name}: as {told['model']} {told['pretrained'] or 'untrained'} left it, for these frames"
-    ]
+    return [f"{folder.name}: as {told['model']} {told['pretrained'] or 'untrained'} left it, for these frames"]
 
 
 def _check_pictures(dataset: Dataset) -> None:
@@ -281,13 +274,11 @@ def _check_pictures(dataset: Dataset) -> None:
     for key, feature in dataset.info["features"].items():
         if feature["dtype"] not in ("video", "image"):
             continue
-        height, width = (CAMERAS | DEPTH | TACTILE)[dataset.source_of(key)[0]][:2]
+        height, width = (RGB | DEPTH | TACTILE)[dataset.source_of(key)[0]][:2]
         wanted = [height, width, 1 if key.endswith("_depth") else 3], ["height", "width", "channels"]
         if (feature["shape"], feature["names"]) != wanted:
             told = f"{feature['shape']} {feature['names']}"
-            raise Mismatch(
-                f"{dataset.folder}/meta/info.json: {key} is {told}, expected {wanted[0]} {wanted[1]}"
-            )
+            raise Mismatch(f"{dataset.folder}/meta/info.json: {key} is {told}, expected {wanted[0]} {wanted[1]}")
 
 
 def _check_episodes(dataset: Dataset) -> None:
@@ -313,27 +304,25 @@ def _check_episodes(dataset: Dataset) -> None:
         }
         for key in videos:
             wanted |= {f"videos/{key}/{name}": value for name, value in place.items()}
-            wanted[f"videos/{key}/from_timestamp"] = (index - first) / FPS
-            wanted[f"videos/{key}/to_timestamp"] = (index - first + len(span)) / FPS
+            wanted[f"videos/{key}/from_timestamp"] = (index - first) / CONTROL_HZ
+            wanted[f"videos/{key}/to_timestamp"] = (index - first + len(span)) / CONTROL_HZ
         index += len(span)
         for name, value in wanted.items():
             if row.get(name) != value:
                 raise Mismatch(
                     f"{dataset.folder}/meta/episodes: episode {number}: {name} is {row.get(name)}, expected {value}"
                 )
-    counted = len(rows), index, len(dataset.tasks), FPS
+    counted = len(rows), index, len(dataset.tasks), CONTROL_HZ
     told = info["total_episodes"], info["total_frames"], info["total_tasks"], info["fps"]
     if counted != told or len(rows) != len(dataset.spans):
-        raise Mismatch(
-            f"{dataset.folder}/meta/info.json says {told} episodes, frames, tasks, fps; counted {counted}"
-        )
+        raise Mismatch(f"{dataset.folder}/meta/info.json says {told} episodes, frames, tasks, fps; counted {counted}")
 
 
 def _files_of_episodes(folder: Path) -> dict[int, tuple[int, int]]:
     """Episode -> chunk and file number of the frame table that holds it.
 
     Raises:
-        Mismatch: an episode lies in two files.
+        Mismatch: An episode lies in two files.
     """
     found: dict[int, tuple[int, int]] = {}
     for path in sorted((folder / "data").rglob("*.parquet")):
@@ -348,7 +337,7 @@ def _episode_rows(folder: Path) -> Iterator[dict[str, Any]]:
     """The rows of meta/episodes in order, without statistics.
 
     Raises:
-        Mismatch: a row says that it is in another file than it is.
+        Mismatch: A row says that it is in another file than it is.
     """
     for path in sorted((folder / "meta/episodes").rglob("*.parquet")):
         names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
@@ -367,12 +356,12 @@ def verify_file(dataset: Dataset, path: Path, min_psnr: float) -> Found:
     """Compares one file of frames, and the videos that belong to it, with the source.
 
     Args:
-        dataset: whose file it is.
-        path: the parquet file.
-        min_psnr: smallest signal-to-noise ratio (dB) of a picture.
+        dataset: Whose file it is.
+        path: The parquet file.
+        min_psnr: Smallest signal-to-noise ratio (dB) of a picture.
 
     Raises:
-        Mismatch: see :func:`verify`.
+        Mismatch: See `verify`.
     """
     features = dataset.info["features"]
     cameras = [key for key, feature in features.items() if feature["dtype"] in ("video", "image")]
@@ -404,17 +393,11 @@ def verify_file(dataset: Dataset, path: Path, min_psnr: float) -> Found:
                 pictures = source[array] if source[array].ndim == 3 else source[array][..., part]
                 if key in videos:
                     stored = _take(videos[key], len(rows), f"{place}: {key}")
-                    found.psnr.setdefault(key, []).extend(
-                        _compare(stored, pictures, features[key], f"{place}: {key}")
-                    )
+                    found.psnr.setdefault(key, []).extend(_compare(stored, pictures, features[key], f"{place}: {key}"))
                     if min(found.psnr[key][-len(rows) :]) < min_psnr:
-                        raise Mismatch(
-                            f"{place}: {key}: PSNR {min(found.psnr[key]):.1f} dB, --min_psnr={min_psnr}"
-                        )
+                        raise Mismatch(f"{place}: {key}: PSNR {min(found.psnr[key]):.1f} dB, --min_psnr={min_psnr}")
                 else:
-                    stored = np.stack(
-                        [np.array(Image.open(io.BytesIO(c["bytes"]))) for c in rows[key].to_pylist()]
-                    )
+                    stored = np.stack([np.array(Image.open(io.BytesIO(c["bytes"]))) for c in rows[key].to_pylist()])
                     if not np.array_equal(stored, pictures.astype(stored.dtype)):
                         raise Mismatch(f"{place}: pictures of {key} are not the source's")
             found.frames += len(rows)
@@ -423,15 +406,11 @@ def verify_file(dataset: Dataset, path: Path, min_psnr: float) -> Found:
             raise Mismatch(f"{_video_of(dataset, key, path)} holds more pictures than {path} frames")
     for episode, state in hashes.items():
         if state.hexdigest() != dataset.manifest["episodes"][episode]["sha256"]:
-            raise Mismatch(
-                f"{dataset.split.folder}: frames of episode {episode} changed since they were converted"
-            )
+            raise Mismatch(f"{dataset.split.folder}: frames of episode {episode} changed since they were converted")
     return found
 
 
-def _wanted(
-    dataset: Dataset, episode: int, first: int, source: dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
+def _wanted(dataset: Dataset, episode: int, first: int, source: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Every column of some frames but the pictures, from the source alone."""
     span, manifest = dataset.spans[episode], dataset.manifest
     n = len(source["actions"])
@@ -444,7 +423,7 @@ def _wanted(
         action, other = source["actions"].copy(), source["rel_actions"]
         action[:, 3] %= 2 * np.pi
     order = dataset.orders[span.scene]
-    blocks = [6 + 6 * order.index(colour) + i for colour in checks.COLOURS for i in range(6)]
+    blocks = [6 + 6 * order.index(colour) + i for colour in COLORS for i in range(6)]
     scene = source["scene_obs"][:, [*range(6), *blocks]]
     if manifest["request"].get("task_in_state"):
         scene = np.hstack([scene, np.eye(len(TASKS) + 1)[tasks, :-1]])  # the last row, of -1, is all zeros
@@ -458,7 +437,7 @@ def _wanted(
         "calvin.window": windows,
         "calvin.task": tasks,
         "calvin.scene": np.full(n, manifest["scene_names"].index(span.scene)),
-        "timestamp": (np.arange(first, first + n) / FPS).astype(np.float32),
+        "timestamp": (np.arange(first, first + n) / CONTROL_HZ).astype(np.float32),
         "frame_index": np.arange(first, first + n),
         "episode_index": np.full(n, episode),
         "index": np.arange(start, start + n),
@@ -485,13 +464,11 @@ def _add(sums: dict[str, list[np.ndarray]], key: str, values: np.ndarray) -> Non
 def _video_of(dataset: Dataset, key: str, data: Path) -> Path:
     """The video that belongs to a file of frames: the same chunk and file number."""
     chunk, file = _chunk_and_file(data)
-    return dataset.folder / dataset.info["video_path"].format(
-        video_key=key, chunk_index=chunk, file_index=file
-    )
+    return dataset.folder / dataset.info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
 
 
 def _chunk_and_file(path: Path) -> tuple[int, int]:
-    """The numbers in ``chunk-000/file-000.…``."""
+    """The numbers in `chunk-000/file-000.…`."""
     return int(path.parent.name.rpartition("-")[2]), int(path.stem.rpartition("-")[2])
 
 
@@ -512,7 +489,7 @@ def _compare(stored: np.ndarray, wanted: np.ndarray, feature: dict[str, Any], pl
     """Signal-to-noise ratio (dB) of each picture of a video; of distances against the farthest that fits.
 
     Raises:
-        Mismatch: the pictures fit better when they are moved by one frame, or with red and blue exchanged.
+        Mismatch: The pictures fit better when they are moved by one frame, or with red and blue exchanged.
     """
     peak = 255.0
     if feature["shape"][2] == 1:
@@ -554,17 +531,20 @@ def _check_stats(dataset: Dataset, sums: dict[str, Any], frames: int) -> None:
                 raise Mismatch(f"{dataset.folder}/meta/stats.json: {name} of {key} is not that of the frames")
 
 
-def main() -> int:
-    """Runs the command; returns 0, 1 if the dataset differs from its source, 2 after an error the user can mend."""
+@draccus.wrap()
+def run(config: VerifyConfig) -> int:
+    """Verifies; 1 if the dataset differs from its source."""
     try:
-        print(verify(draccus.parse(VerifyConfig)))
+        print(verify(config))
     except Mismatch as error:
         print(f"mismatch: {error}", file=sys.stderr)
         return 1
-    except (OSError, ValueError, DraccusException) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     return 0
+
+
+def main() -> int:
+    """Entry point of `lansar-verify`."""
+    return run_command("lansar-verify", run)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """CALVIN for LeRobot: the desk as an environment, its demonstrations as LeRobotDatasets, LanSAR as a policy.
 
 Importing this package registers the environment with gymnasium and nothing else, so the desk can be used without the
-twenty seconds that importing LeRobot takes. ``lerobot_policy_lansar`` registers policy and environment with LeRobot.
+twenty seconds that importing LeRobot takes. `lerobot_policy_lansar` registers policy and environment with LeRobot.
 """
 
 import gymnasium

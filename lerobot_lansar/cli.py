@@ -1,6 +1,6 @@
-"""``lerobot``: one command in front of LeRobot's own, with ``key=value`` options.
+"""`lerobot`: one command in front of LeRobot's own, with `key=value` options.
 
-LeRobot 0.6 installs ``lerobot-train``, ``lerobot-eval``, … but no ``lerobot``. This one only rewrites the
+LeRobot 0.6 installs `lerobot-train`, `lerobot-eval`, … but no `lerobot`. This one only rewrites the
 options and hands over.
 """
 
@@ -22,23 +22,23 @@ env=NAME is --env.type=NAME. lerobot COMMAND --help lists a command's options.
 
 
 def commands() -> dict[str, Path]:
-    """LeRobot's commands installed beside this Python, by the word after ``lerobot-``."""
+    """LeRobot's commands installed beside this Python, by the word after `lerobot-`."""
     scripts = Path(sysconfig.get_path("scripts"))
     return {path.stem.removeprefix("lerobot-"): path for path in sorted(scripts.glob("lerobot-*"))}
 
 
 def translate(command: str, arguments: list[str]) -> list[str]:
-    """Turns ``key=value`` into LeRobot's ``--key=value``.
+    """Turns `key=value` into LeRobot's `--key=value`.
 
     Args:
-        command: the word after ``lerobot``.
-        arguments: what follows it.
+        command: The word after `lerobot`.
+        arguments: What follows it.
 
     Returns:
-        The arguments of ``lerobot-<command>``.
+        The arguments of `lerobot-<command>`.
 
     Raises:
-        ValueError: an argument is neither an option nor ``key=value``.
+        ValueError: An argument is neither an option nor `key=value`.
     """
     translated = []
     for position, argument in enumerate(arguments):
@@ -49,9 +49,7 @@ def translate(command: str, arguments: list[str]) -> list[str]:
         if argument.startswith("-") or (follows_option and not equals):
             translated.append(argument)
         elif not equals:
-            raise ValueError(
-                f"{argument!r} is neither key=value nor an option; see `lerobot {command} --help`"
-            )
+            raise ValueError(f"{argument!r} is neither key=value nor an option; see `lerobot {command} --help`")
         elif key == "policy":
             # A checkpoint is a folder or user/model on the hub; only training makes a policy from its name.
             is_checkpoint = command == "eval" or "/" in value or Path(value).exists()

@@ -10,8 +10,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
+from lerobot_lansar.calvin import TASKS
 from lerobot_lansar.demos.demonstrator import Demonstration, demonstrate
-from lerobot_lansar.desk import TASKS, Desk
+from lerobot_lansar.desk import Desk
 
 SIZE, MOMENTS, COLUMNS, LABEL = 112, 6, 2, 18
 IN_TURN = "BADC"
@@ -19,7 +20,7 @@ IN_TURN = "BADC"
 
 
 def demonstration(desk: Desk, task: str, seed: int) -> Demonstration:
-    """The first accepted demonstration of ``task``."""
+    """The first accepted demonstration of `task`."""
     for attempt in range(20):
         found = demonstrate(desk, task, np.random.default_rng([seed, attempt]))
         if found is not None:

@@ -1,4 +1,4 @@
-"""The whole line with LeRobot's own commands: record, convert, train, evaluate, report. Run by ``make quickstart``.
+"""The whole line with LeRobot's own commands: record, convert, train, evaluate, report. Run by `make quickstart`.
 
 Every step is a command printed before it runs, so each can be repeated by hand. Steps whose result is there already
 are not repeated. Ends with outputs/quickstart/summary.json.
@@ -38,7 +38,7 @@ EVALUATION_SEED = 100_000  # far from the demonstrations' seed: starts that were
 
 
 def run(title: str, *command: object, log: Path | None = None) -> None:
-    """Runs one of the installed commands in the checkout, with its output in ``log`` if given.
+    """Runs one of the installed commands in the checkout, with its output in `log` if given.
 
     Raises:
         QuickstartError: The command failed.

@@ -1,4 +1,4 @@
-"""``lerobot WORD key=value`` hands over to LeRobot's own commands."""
+"""`lerobot WORD key=value` hands over to LeRobot's own commands."""
 
 import os
 import sys

@@ -38,17 +38,30 @@ def dataset(run, work):
     tasks = "--tasks=[turn_on_led,lift_red_block_table]"
     run("lansar-record", "--output_dir=desk", tasks, "--scene=[A,B,C,D]", "--episodes=8")
     run(
-        "lansar-convert", "--root=desk", "--split=training", "--repo_id=me/desk", "--output_dir=data",
-        "--embed=true", "--clip.model=lansar-tiny", "--clip.pretrained=",
-    )  # fmt: skip
+        "lansar-convert",
+        "--root=desk",
+        "--split=training",
+        "--repo_id=me/desk",
+        "--output_dir=data",
+        "--embed=true",
+        "--clip.model=lansar-tiny",
+        "--clip.pretrained=",
+    )
     return ["--dataset.repo_id=me/desk", f"--dataset.root={work / 'data'}"]
 
 
 SMALL_LANSAR = [
-    "--policy.hidden=32", "--policy.context_layers=1", "--policy.context_heads=2", "--policy.decoder_layers=1",
-    "--policy.decoder_heads=2", "--policy.feedforward=64", "--policy.clip.model=lansar-tiny",
-    "--policy.clip.pretrained=", "--policy.device=cpu", "--policy.push_to_hub=false",
-]  # fmt: skip
+    "--policy.hidden=32",
+    "--policy.context_layers=1",
+    "--policy.context_heads=2",
+    "--policy.decoder_layers=1",
+    "--policy.decoder_heads=2",
+    "--policy.feedforward=64",
+    "--policy.clip.model=lansar-tiny",
+    "--policy.clip.pretrained=",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+]
 TRAINING = ["--batch_size=4", "--num_workers=0", "--log_freq=1"]
 EVALUATION = ["--env.type=calvin", "--env.steps_per_command=5", "--policy.device=cpu"]
 
@@ -58,9 +71,16 @@ def lansar(run, dataset):
     """A LanSAR with pictures after two updates, trained by the short form of the command."""
     options = [option.removeprefix("--") for option in (*dataset, *SMALL_LANSAR[:-2], *TRAINING)]
     run(
-        "lerobot", "train", "policy=lansar", *options, "--policy.device=cpu", "--policy.push_to_hub=false",
-        "steps=2", "save_freq=2", "output_dir=out/lansar",
-    )  # fmt: skip
+        "lerobot",
+        "train",
+        "policy=lansar",
+        *options,
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "steps=2",
+        "save_freq=2",
+        "output_dir=out/lansar",
+    )
     return "out/lansar/checkpoints/last/pretrained_model"
 
 
@@ -79,18 +99,22 @@ def test_lansar_evaluates_the_same_with_any_batch_size(run, work, lansar):
     # batch 1 runs in this process, batch 3 in workers, and its last batch is not full
     for size in (1, 3):
         run(
-            "lerobot-eval", f"--policy.path={lansar}", *EVALUATION, "--env.task=turn_on_led", "--eval.n_episodes=4",
-            "--env.control_mode=abs", "--env.steps_per_command=25", f"--eval.batch_size={size}", "--seed=0",
-            f"--env.results_dir=results{size}", f"--output_dir=eval{size}",
-        )  # fmt: skip
+            "lerobot-eval",
+            f"--policy.path={lansar}",
+            *EVALUATION,
+            "--env.task=turn_on_led",
+            "--eval.n_episodes=4",
+            "--env.control_mode=abs",
+            "--env.steps_per_command=25",
+            f"--eval.batch_size={size}",
+            "--seed=0",
+            f"--env.results_dir=results{size}",
+            f"--output_dir=eval{size}",
+        )
     assert successes(work, "eval1") == successes(work, "eval3")
     assert len(successes(work, "eval1")[0]) == 4
     episodes = [
-        {
-            json.loads(line)["seed"]: json.loads(line)["commands"]
-            for f in (work / d).iterdir()
-            for line in f.open()
-        }
+        {json.loads(line)["seed"]: json.loads(line)["commands"] for f in (work / d).iterdir() for line in f.open()}
         for d in ("results1", "results3")
     ]
     assert all(episodes[0][seed] == episodes[1][seed] for seed in range(4))
@@ -112,9 +136,16 @@ def film(folder, episode):
 
 def test_a_chain_is_evaluated_and_reported(run, work, lansar):
     run(
-        "lerobot-eval", f"--policy.path={lansar}", *EVALUATION, "--env.control_mode=abs", "--eval.n_episodes=1",
-        "--eval.batch_size=1", "--seed=0", "--output_dir=eval_chain", "--env.results_dir=eval_chain",
-    )  # fmt: skip
+        "lerobot-eval",
+        f"--policy.path={lansar}",
+        *EVALUATION,
+        "--env.control_mode=abs",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--seed=0",
+        "--output_dir=eval_chain",
+        "--env.results_dir=eval_chain",
+    )
     printed = run("lansar-report", "--eval_dir=eval_chain", f"--policy_path={lansar}")
     assert "rotate_blue_block_right" in printed  # chain 0's first task
     assert "built-in" in printed
@@ -125,9 +156,15 @@ def test_a_chain_is_evaluated_and_reported(run, work, lansar):
 
 def test_other_control_mode_stops_the_evaluation_with_advice(run, lansar):
     printed = run(
-        "lerobot-eval", f"--policy.path={lansar}", *EVALUATION, "--env.control_mode=rel", "--eval.n_episodes=1",
-        "--eval.batch_size=1", "--output_dir=eval_mode", fails=True,
-    )  # fmt: skip
+        "lerobot-eval",
+        f"--policy.path={lansar}",
+        *EVALUATION,
+        "--env.control_mode=rel",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--output_dir=eval_mode",
+        fails=True,
+    )
     assert "--env.control_mode=abs" in printed
 
 
@@ -136,23 +173,45 @@ def test_training_resumes_and_fine_tunes(run, work, dataset, lansar):
     run("lerobot-train", f"--config_path={config}", "--resume=true", "--steps=4")
     assert (work / "out/lansar/checkpoints/000004/pretrained_model/model.safetensors").is_file()
     run(
-        "lerobot-train", f"--policy.path={lansar}", "--policy.push_to_hub=false", *dataset, *TRAINING, "--steps=2",
+        "lerobot-train",
+        f"--policy.path={lansar}",
+        "--policy.push_to_hub=false",
+        *dataset,
+        *TRAINING,
+        "--steps=2",
         "--output_dir=out/tuned",
-    )  # fmt: skip
+    )
     assert (work / "out/tuned/checkpoints/last/pretrained_model/model.safetensors").is_file()
 
 
 def test_act_trains_on_the_dataset_and_runs_on_the_desk(run, work, dataset):
     run(
-        "lerobot-train", "--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu", *dataset, *TRAINING,
-        "--policy.pretrained_backbone_weights=null", "--policy.dim_model=32", "--policy.n_heads=2",
-        "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1",
-        "--policy.chunk_size=4", "--policy.n_action_steps=4", "--steps=2", "--output_dir=out/act",
-    )  # fmt: skip
+        "lerobot-train",
+        "--policy.type=act",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        *dataset,
+        *TRAINING,
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.dim_model=32",
+        "--policy.n_heads=2",
+        "--policy.dim_feedforward=64",
+        "--policy.n_encoder_layers=1",
+        "--policy.n_vae_encoder_layers=1",
+        "--policy.chunk_size=4",
+        "--policy.n_action_steps=4",
+        "--steps=2",
+        "--output_dir=out/act",
+    )
     run(
-        "lerobot-eval", "--policy.path=out/act/checkpoints/last/pretrained_model", *EVALUATION,
-        "--env.task=turn_on_led", "--eval.n_episodes=2", "--eval.batch_size=2", "--output_dir=eval_act",
-    )  # fmt: skip
+        "lerobot-eval",
+        "--policy.path=out/act/checkpoints/last/pretrained_model",
+        *EVALUATION,
+        "--env.task=turn_on_led",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--output_dir=eval_act",
+    )
     assert len(successes(work, "eval_act")[0]) == 2
 
 
@@ -163,23 +222,43 @@ def test_diffusion_trains_on_one_camera_of_the_dataset_and_runs_on_the_desk(run,
         "observation.images.static": {"type": "VISUAL", "shape": [3, 200, 200]},
     }
     run(
-        "lerobot-train", "--policy.type=diffusion", "--policy.push_to_hub=false", "--policy.device=cpu", *dataset,
-        *TRAINING, f"--policy.input_features={json.dumps(inputs)}", "--policy.down_dims=[32,64]", "--policy.horizon=8",
-        "--policy.n_action_steps=4", "--policy.num_inference_steps=2", "--policy.pretrained_backbone_weights=null",
-        "--steps=2", "--output_dir=out/diffusion",
-    )  # fmt: skip
+        "lerobot-train",
+        "--policy.type=diffusion",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        *dataset,
+        *TRAINING,
+        f"--policy.input_features={json.dumps(inputs)}",
+        "--policy.down_dims=[32,64]",
+        "--policy.horizon=8",
+        "--policy.n_action_steps=4",
+        "--policy.num_inference_steps=2",
+        "--policy.pretrained_backbone_weights=null",
+        "--steps=2",
+        "--output_dir=out/diffusion",
+    )
     run(
-        "lerobot-eval", "--policy.path=out/diffusion/checkpoints/last/pretrained_model", *EVALUATION,
-        "--env.task=turn_on_led", "--eval.n_episodes=1", "--eval.batch_size=1", "--output_dir=eval_diffusion",
-    )  # fmt: skip
+        "lerobot-eval",
+        "--policy.path=out/diffusion/checkpoints/last/pretrained_model",
+        *EVALUATION,
+        "--env.task=turn_on_led",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--output_dir=eval_diffusion",
+    )
     assert len(successes(work, "eval_diffusion")[0]) == 1
 
 
 def test_unusable_requests_are_answered_clearly(run, dataset):
     assert "'juggle' is unknown" in run(
-        "lerobot-eval", "--policy.type=act", "--policy.device=cpu", "--env.type=calvin", "--env.task=juggle",
-        "--output_dir=nowhere", fails=True,
-    )  # fmt: skip
+        "lerobot-eval",
+        "--policy.type=act",
+        "--policy.device=cpu",
+        "--env.type=calvin",
+        "--env.task=juggle",
+        "--output_dir=nowhere",
+        fails=True,
+    )
     printed = run("lansar-convert", "--root=elsewhere", "--repo_id=me/x", "--output_dir=x", fails=True)
     assert "elsewhere" in printed
     assert "Traceback" not in printed

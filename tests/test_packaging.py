@@ -52,9 +52,7 @@ def test_every_file_that_the_documentation_names_exists():
         (page.name, path)
         for page in pages
         if page.is_file()
-        for path in re.findall(
-            r"(?<![\w/])(?:configs|docs|benchmarks|scripts|tests)/[\w./]*\.\w+", page.read_text()
-        )
+        for path in re.findall(r"(?<![\w/])(?:configs|docs|benchmarks|scripts|tests)/[\w./]*\.\w+", page.read_text())
     }
     assert len(named) > 10
     assert [entry for entry in sorted(named) if not (ROOT / entry[1]).exists()] == []

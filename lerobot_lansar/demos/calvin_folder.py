@@ -15,7 +15,8 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from ..desk.scenes import COLORS, Scene
+from ..calvin import block_columns
+from ..desk.scenes import Scene
 
 FRAME = "episode_{:07d}.npz"
 STATES = ("robot_obs", "scene_obs")
@@ -28,7 +29,7 @@ def _process() -> str:
 
 @dataclass
 class Unit:
-    """Frames that were recorded in one go and lie as ``000000.npz`` … in a folder of their own.
+    """Frames that were recorded in one go and lie as `000000.npz` … in a folder of their own.
 
     Attributes:
         scene: The scene's letter.
@@ -37,7 +38,7 @@ class Unit:
         windows: (first, end, task): frames [first, end) fulfil the task.
         tried: Task to how often it was tried.
         accepted: Task to how often the oracle saw it fulfilled.
-        sums: For ``robot_obs`` and ``scene_obs`` (as on disk) the sums of values and of squares.
+        sums: For `robot_obs` and `scene_obs` (as on disk) the sums of values and of squares.
     """
 
     scene: str
@@ -56,26 +57,26 @@ class Unit:
 
     @classmethod
     def load(cls, file: Path) -> "Unit":
-        """Reads what :meth:`save` wrote."""
+        """Reads what `save` wrote."""
         return cls(**json.loads(file.read_text()))
 
 
 class FrameWriter:
-    """Writes one npz per frame into ``folder``, which appears when the writer is closed without an error.
+    """Writes one npz per frame into `folder`, which appears when the writer is closed without an error.
 
-    ``scene_obs`` comes with blocks in red, blue, pink order and goes to disk in the scene's original order, which is
+    `scene_obs` comes with blocks in red, blue, pink order and goes to disk in the scene's original order, which is
     what CALVIN's own files have.
     """
 
     def __init__(self, folder: Path, scene: Scene):
         self._folder = folder
         self._partial = folder.with_name(f"{folder.name}-{_process()}.partial")
-        self._columns = _original_order(scene)
+        self._columns = block_columns(tuple(scene.blocks))
         self._sums: dict[str, np.ndarray] = {}
         self.frames = 0
 
     def add(self, frame: dict[str, np.ndarray]) -> None:
-        """Writes the next frame: ``robot_obs`` (15,), ``scene_obs`` (24,), actions (7,) and pictures."""
+        """Writes the next frame: `robot_obs` (15,), `scene_obs` (24,), actions (7,) and pictures."""
         data = {**frame, "scene_obs": frame["scene_obs"][self._columns]}
         for key in STATES:
             sums = np.stack([data[key], data[key] ** 2])
@@ -91,7 +92,7 @@ class FrameWriter:
         self.frames += 1
 
     def sums(self) -> dict[str, list[list[float]]]:
-        """See :class:`Unit`."""
+        """See `Unit`."""
         return {key: value.tolist() for key, value in self._sums.items()}
 
     def __enter__(self) -> "FrameWriter":
@@ -107,14 +108,6 @@ class FrameWriter:
             shutil.rmtree(self._partial, ignore_errors=True)
 
 
-def _original_order(scene: Scene) -> list[int]:
-    columns = list(range(6))
-    for color in scene.blocks:
-        first = 6 + 6 * COLORS.index(color)
-        columns += range(first, first + 6)
-    return columns
-
-
 def publish_split(
     target: Path,
     units: Sequence[tuple[Path, Unit, Sequence[str]]],
@@ -122,14 +115,14 @@ def publish_split(
     config: dict[str, Any],
     sentences: dict[str, str],
 ) -> int:
-    """Builds one split (``training`` or ``validation``) from recorded units; ``target`` appears when complete.
+    """Builds one split (`training` or `validation`) from recorded units; `target` appears when complete.
 
     Args:
         target: The split's folder; must not exist.
         units: Folder, unit and the sentences of its windows, in the order in which they get their frame numbers; units
             of one scene follow each other.
         first_frame: Number of the first frame.
-        config: Kept in ``.hydra/merged_config.yaml``.
+        config: Kept in `.hydra/merged_config.yaml`.
         sentences: The benchmark's sentence of each task, listed by the validation split.
 
     Returns:
@@ -145,9 +138,7 @@ def publish_split(
     tasks: list[str] = []
     said: list[str] = []
     scenes: dict[str, list[int]] = {}
-    for folder, unit, unit_sentences in tqdm(
-        units, desc=f"writing {target.name}", unit="recording", leave=False
-    ):
+    for folder, unit, unit_sentences in tqdm(units, desc=f"writing {target.name}", unit="recording", leave=False):
         for index in range(unit.frames):
             _link(folder / f"{index:06d}.npz", partial / FRAME.format(number + index))
         recordings += [(number + start, number + end - 1) for start, end in unit.recordings]  # both inclusive
@@ -186,7 +177,7 @@ def _statistics(units: Sequence[Unit]) -> dict[str, dict[str, list[float]]]:
 
 
 def group_by_scene(scenes: Sequence[str], count: int) -> list[str]:
-    """The scene of each of ``count`` units: as even as possible, units of one scene following each other.
+    """The scene of each of `count` units: as even as possible, units of one scene following each other.
 
     >>> group_by_scene(["A", "B"], 5)
     ['A', 'A', 'A', 'B', 'B']

@@ -5,16 +5,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..desk import TASKS, Desk, DeskError
+from ..calvin import STEPS_PER_COMMAND, relative_action
+from ..desk import Desk, DeskError, is_fulfilled
 from ..desk.desk import Observation
 from ..desk.oracle import Snapshot
 from ..desk.starts import sample_start
-from .motion import Disturbance, Motion, relative_action
+from .motion import Disturbance, Motion
 from .moves import Skill, Style, View
 from .skills import SKILLS
 
-MAX_STEPS = 360
-"""Control steps that CALVIN's protocol gives a command."""
 AFTERWARDS = 2
 """The oracle must be satisfied in one frame and in so many after it; then a demonstration ends."""
 _PATIENCE = 12  # control steps without progress after which the next waypoint is due
@@ -28,8 +27,8 @@ class Demonstration:
     """One accepted demonstration; row t of each array is frame t.
 
     Attributes:
-        frames: Key to (n, ...) array: ``robot_obs`` (15,), ``scene_obs`` (24,) with blocks in red, blue, pink order,
-            ``actions`` (7,) absolute, ``rel_actions`` (7,) and the desk's pictures.
+        frames: Key to (n, ...) array: `robot_obs` (15,), `scene_obs` (24,) with blocks in red, blue, pink order,
+            `actions` (7,) absolute, `rel_actions` (7,) and the desk's pictures.
     """
 
     task: str
@@ -47,22 +46,22 @@ def carry_out(
     *,
     variety: float = 1.0,
     noise: float = 0.2,
-    steps: int = MAX_STEPS,
+    steps: int = STEPS_PER_COMMAND,
     fulfilled: Callable[[Snapshot], bool] = lambda _: False,
 ) -> Iterator[tuple[Frame, Observation, Snapshot]]:
-    """Carries out a skill from the present state; ends once it is and stays ``fulfilled``, or at the skill's end.
+    """Carries out a skill from the present state; ends once it is and stays `fulfilled`, or at the skill's end.
 
     Args:
-        desk: In the state that ``obs`` shows.
+        desk: In the state that `obs` shows.
         obs: The latest observation.
         skill: Where the hand goes.
         rng: Decides style and noise.
-        variety, noise: As for :func:`demonstrate`.
+        variety, noise: As for `demonstrate`.
         steps: Control steps at most.
         fulfilled: Asked after every step.
 
     Yields:
-        For each control step its frame (the observation before it, ``actions``, ``rel_actions``), and the observation
+        For each control step its frame (the observation before it, `actions`, `rel_actions`), and the observation
         and the snapshot after it.
     """
     view = View(desk.scene, obs["robot_obs"], obs["scene_obs"], rng, Style.sample(rng, variety))
@@ -100,11 +99,11 @@ def carry_out(
 def demonstrate(
     desk: Desk, task: str, rng: np.random.Generator, noise: float = 0.2, variety: float = 1.0
 ) -> Demonstration | None:
-    """Tries ``task`` once from a random feasible start.
+    """Tries `task` once from a random feasible start.
 
     Args:
         desk: Any desk; the episode's pictures are those of its cameras.
-        task: One of :data:`SKILLS`.
+        task: One of `SKILLS`.
         rng: Decides start, approach, speed and noise.
         noise: Standard deviation of the disturbance of executed actions, in relative action units; now and then a
             push of some steps, four times as strong, comes on top. What is recorded is the intended action, so a
@@ -128,10 +127,10 @@ def demonstrate(
         rng,
         variety=variety,
         noise=noise,
-        fulfilled=lambda now: TASKS[task](start, now),
+        fulfilled=lambda now: is_fulfilled(task, start, now),
     ):
         rows.append(frame)
-        stays = stays + 1 if TASKS[task](start, snapshot) else 0
+        stays = stays + 1 if is_fulfilled(task, start, snapshot) else 0
     if stays <= AFTERWARDS:
         return None
     return Demonstration(task, {key: np.stack([row[key] for row in rows]) for key in rows[0]})

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..desk.robot import ANGLE_STEP, POSITION_STEP
+from ..calvin import POSE_UNITS, TCP_POSE, wrap_angle
 from .moves import Waypoint, turned
 
 RESPONSE = 0.5
@@ -15,28 +15,10 @@ LEAD = np.array([0.02] * 3 + [0.08] * 3)
 """How far (m, rad) the planned pose may be ahead of the real one when something resists."""
 
 
-def relative_action(action: np.ndarray, robot_obs: np.ndarray) -> np.ndarray:
-    """CALVIN's ``rel_actions``: the way from the present TCP pose to the commanded one in units of 0.02 m and 0.05
-    rad, clipped to +-1, with angles taken the short way round; (7,)."""
-    rotation = wrap(action[3:6] - robot_obs[3:6])
-    return np.concatenate(
-        [
-            np.clip((action[:3] - robot_obs[:3]) / POSITION_STEP, -1, 1),
-            np.clip(rotation / ANGLE_STEP, -1, 1),
-            action[6:],
-        ]
-    )
-
-
-def wrap(angles: np.ndarray) -> np.ndarray:
-    """Angles (rad) brought into [-pi, pi)."""
-    return (angles + np.pi) % (2 * np.pi) - np.pi
-
-
 def _difference(target: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """target - pose for poses of xyz and euler, (6,); the yaw never the way on which the last joint ends."""
     way = target - pose
-    way[3:5] = wrap(way[3:5])
+    way[3:5] = wrap_angle(way[3:5])
     way[5] = turned(target[5]) - turned(pose[5])
     return way
 
@@ -44,7 +26,7 @@ def _difference(target: np.ndarray, pose: np.ndarray) -> np.ndarray:
 class Motion:
     """Follows waypoints with a planned pose that moves with limited speed and acceleration.
 
-    The planned pose runs along straight lines, at most :data:`LEAD` ahead of the hand; commands undo half of the
+    The planned pose runs along straight lines, at most `LEAD` ahead of the hand; commands undo half of the
     hand's deviation from it at every step. All commands stay within a relative action of +-1 per axis.
 
     Args:
@@ -54,18 +36,18 @@ class Motion:
 
     def __init__(self, robot_obs: np.ndarray, speed: float):
         self._speed = speed
-        self._plan = robot_obs[:6].copy()
+        self._plan = robot_obs[TCP_POSE].copy()
         self._velocity: np.ndarray = np.zeros(6)
 
     def error(self, waypoint: Waypoint, robot_obs: np.ndarray) -> tuple[float, float]:
         """What is left to the waypoint: m, and the largest angle in rad."""
-        way = _difference(np.concatenate([waypoint.position, waypoint.euler]), robot_obs[:6])
+        way = _difference(np.concatenate([waypoint.position, waypoint.euler]), robot_obs[TCP_POSE])
         return float(np.linalg.norm(way[:3])), float(np.abs(way[3:]).max())
 
     def toward(self, waypoint: Waypoint, robot_obs: np.ndarray) -> np.ndarray:
         """The next absolute action, (7,)."""
         target = np.concatenate([waypoint.position, waypoint.euler])
-        pose = robot_obs[:6]
+        pose = robot_obs[TCP_POSE]
         ahead = np.clip(_difference(self._plan, pose), -LEAD, LEAD)
         self._plan = pose + ahead
         left = _difference(target, self._plan)
@@ -75,15 +57,14 @@ class Motion:
             self._velocity[3:], left[3:], TOP_TURN * (1 + self._speed) / 2, TURN_ACCELERATION
         )
         self._plan = self._plan + self._velocity
-        step = np.array([POSITION_STEP] * 3 + [ANGLE_STEP] * 3)
-        command = np.clip(self._velocity / RESPONSE + ahead, -step, step)
+        command = np.clip(self._velocity / RESPONSE + ahead, -POSE_UNITS, POSE_UNITS)
         action = np.concatenate([pose + command, [waypoint.gripper]])
-        action[3:6] = wrap(action[3:6])
+        action[3:6] = wrap_angle(action[3:6])
         return action
 
 
 def _accelerate(velocity: np.ndarray, left: np.ndarray, top: float, acceleration: float) -> np.ndarray:
-    """The next velocity (3,) on the way ``left``: towards its end, in time to stop there."""
+    """The next velocity (3,) on the way `left`: towards its end, in time to stop there."""
     distance = float(np.linalg.norm(left))
     wanted = left * min(top, np.sqrt(2 * acceleration * distance), distance) / max(distance, 1e-9)
     change = wanted - velocity
@@ -105,7 +86,7 @@ class Disturbance:
         self._pushed = 0
 
     def of(self, action: np.ndarray, careful: bool) -> np.ndarray:
-        """The action that is really executed, (7,); half the noise and no push while ``careful``."""
+        """The action that is really executed, (7,); half the noise and no push while `careful`."""
         if self._rng.uniform() < 0.025 and self._pushed == 0 and not careful:
             self._push, self._pushed = self._rng.normal(0, 4 * self._noise, 6), 4
         slips = self._rng.uniform() < 0.002 * self._noise
@@ -113,4 +94,4 @@ class Disturbance:
         units += self._push if self._pushed and not careful else 0.0
         gripper = -action[6:] if slips else action[6:]
         self._pushed = max(self._pushed - 1, 0)
-        return np.concatenate([action[:6] + units * ([POSITION_STEP] * 3 + [ANGLE_STEP] * 3), gripper])
+        return np.concatenate([action[:6] + units * POSE_UNITS, gripper])

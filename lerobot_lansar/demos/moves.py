@@ -1,7 +1,7 @@
 """What skills are made of: waypoints, what a skill sees of the desk, and the few moves that all of them share.
 
 Positions in metres in the world frame, angles in radians. A hand that points straight down has euler (pi, 0, yaw);
-:func:`pointing` leans it.
+`pointing` leans it.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..desk import COLORS
+from ..calvin import COLORS, DRAWER, GRIPPER_ACTION, GRIPPER_WIDTH, block_pose
 from ..desk.robot import BASE_POSITION
 from ..desk.scenes import BLOCK_LENGTHS, BLOCK_SIDE, Scene
 
@@ -79,7 +79,7 @@ class Style:
 
     @classmethod
     def sample(cls, rng: np.random.Generator, variety: float) -> "Style":
-        """A random style; ``variety`` from 0 (always the same) to 1."""
+        """A random style; `variety` from 0 (always the same) to 1."""
         return cls(
             speed=0.9 + variety * rng.uniform(-0.25, 0.1),
             cruise=0.58 + variety * rng.uniform(-0.01, 0.06),
@@ -92,7 +92,7 @@ class Style:
 
 @dataclass
 class View:
-    """What a skill sees: the scene's fixed numbers and the latest ``robot_obs`` (15,) and ``scene_obs`` (24,)."""
+    """What a skill sees: the scene's fixed numbers and the latest `robot_obs` (15,) and `scene_obs` (24,)."""
 
     scene: Scene
     robot_obs: np.ndarray
@@ -108,12 +108,11 @@ class View:
     @property
     def drawer(self) -> float:
         """How far the drawer is open (m)."""
-        return float(self.scene_obs[1])
+        return float(self.scene_obs[DRAWER])
 
     def block(self, color: str) -> np.ndarray:
         """Pose of a block: xyz (m), euler (rad); (6,)."""
-        index = 6 + 6 * COLORS.index(color)
-        return self.scene_obs[index : index + 6]
+        return self.scene_obs[block_pose(COLORS.index(color))]
 
     def length(self, color: str) -> float:
         """A block's longest side (m)."""
@@ -126,7 +125,7 @@ class View:
     def holds(self, color: str) -> bool:
         """Whether the closed hand has the block between its fingers."""
         near = np.linalg.norm(self.block(color)[:3] - self.tcp) < 0.045
-        return bool(near and self.robot_obs[14] < 0 and self.robot_obs[6] > 0.02)
+        return bool(near and self.robot_obs[GRIPPER_ACTION] < 0 and self.robot_obs[GRIPPER_WIDTH] > 0.02)
 
     def lost(self, color: str) -> bool:
         """Whether the block fell off the desk."""
@@ -137,7 +136,7 @@ class View:
         return next((color for color in COLORS if self.holds(color)), None)
 
     def scatter(self, spread: float) -> float:
-        """A random number within +-``spread`` (m or rad), less when the style asks for less variety."""
+        """A random number within +-`spread` (m or rad), less when the style asks for less variety."""
         return float(self.rng.uniform(-spread, spread) * self.style.spread)
 
     def go(
@@ -147,7 +146,7 @@ class View:
         euler: np.ndarray | None = None,
         **options: float | Callable[[], bool] | None,
     ) -> Waypoint:
-        """A waypoint; without ``euler`` the hand points down and leans outward where the arm has to stretch."""
+        """A waypoint; without `euler` the hand points down and leans outward where the arm has to stretch."""
         xyz = np.asarray(position, float)
         if euler is None:
             euler = pointing(FORWARD + self.style.yaw, *stretch(xyz))
@@ -155,7 +154,7 @@ class View:
 
 
 def pointing(yaw: float, lean_x: float = 0.0, lean_y: float = 0.0) -> np.ndarray:
-    """Euler angles (3,) of a hand that points down with ``yaw`` and then leans outward by (lean_x, lean_y) rad."""
+    """Euler angles (3,) of a hand that points down with `yaw` and then leans outward by (lean_x, lean_y) rad."""
     down = Rotation.from_euler("xyz", [np.pi, 0.0, yaw])
     return (Rotation.from_rotvec([lean_y, -lean_x, 0.0]) * down).as_euler("xyz")
 
@@ -191,9 +190,7 @@ def retreat(view: View, gripper: float, keep: Callable[[], bool] | None = None) 
     if in_cabinet(view.tcp):
         back = view.tcp - 0.12 * approach(view.robot_obs[3:6])
         yield view.go(back, gripper, view.robot_obs[3:6].copy(), **options)
-        yield view.go(
-            (view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.robot_obs[3:6].copy(), **options
-        )
+        yield view.go((view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.robot_obs[3:6].copy(), **options)
     elif view.tcp[2] < view.style.cruise - 0.03:
         above = (view.tcp[0], min(view.tcp[1], -0.05), view.style.cruise)
         yield view.go(above, gripper, view.robot_obs[3:6].copy(), **options)
@@ -206,7 +203,7 @@ def travel(
     euler: np.ndarray | None = None,
     keep: Callable[[], bool] | None = None,
 ) -> Iterator[Waypoint]:
-    """Over everything to a place above ``position``; ends at cruising height or at the place if that is higher."""
+    """Over everything to a place above `position`; ends at cruising height or at the place if that is higher."""
     x, y, z = position
     if in_cabinet(view.tcp) and y > -0.02 and abs(view.tcp[0] - x) < 0.08:
         return
@@ -237,9 +234,7 @@ def grasp_yaws(view: View, color: str) -> list[float]:
     def badness(candidate: float) -> float:
         # the hand is 0.2 m wide across its fingers: near the cabinet it must stand along it
         sideways = abs(np.sin(candidate - FORWARD)) * (3.0 if pose[1] > -0.10 else 0.5)
-        long_side = 0.5 * (
-            horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE
-        )
+        long_side = 0.5 * (horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE)
         return abs(candidate - now) + sideways + long_side
 
     return sorted((y for y in yaws if YAWS[0] <= y <= YAWS[1]), key=badness)

@@ -1,338 +1,261 @@
-"""``lansar-play``: drive the gripper by keyboard, see what the oracle says, record demonstrations of your own."""
+"""Play: tasks follow each other without a reset, as in CALVIN's data. Language windows are cut from that: CALVIN's
+short ones around each fulfilled task, or whole subtasks, from the command to its fulfilment."""
 
-import os
-import re
-import shutil
-import sys
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from functools import partial
 
-import draccus
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
-from tqdm import tqdm
 
-from ..desk import CONTROL_HZ, TASKS, Desk, DeskError, Observation, SimulationError
-from ..desk.commands import load_commands
-from ..desk.robot import ANGLE_STEP, POSITION_STEP
-from ..desk.starts import sample_start
-from .calvin_folder import FrameWriter, Unit, publish_split
-from .motion import relative_action
+from ..calvin import CHAIN_LENGTH, COLORS, GRIPPER_ACTION, STEPS_PER_COMMAND, SWITCH, TASKS, WINDOW_FRAMES
+from ..desk import Desk, SimulationError, completed_tasks, is_fulfilled
+from ..desk.desk import Observation
+from ..desk.oracle import DRAWER, PLANK, TABLE, Condition, Snapshot, is_stacked
+from ..desk.scenes import DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
+from ..desk.starts import REACH, TABLE_Z, beside_door, sample_start
+from .calvin_folder import FrameWriter, Unit
+from .demonstrator import AFTERWARDS, carry_out
+from .moves import Skill, Style, View, Waypoint, lying
+from .skills import SKILLS
+from .skills.blocks import put_down
 
-MOVES = {
-    "d": (0, 1.0), "a": (0, -1.0), "w": (1, 1.0), "s": (1, -1.0), "r": (2, 1.0), "f": (2, -1.0),
-    "z": (3, 1.0), "x": (3, -1.0), "t": (4, 1.0), "g": (4, -1.0), "q": (5, 1.0), "e": (5, -1.0),
-}  # fmt: skip
-"""Key to axis (x, y, z, roll, pitch, yaw) and direction of a relative action."""
-HELP = (
-    "A D   left, right",
-    "W S   back, front",
-    "R F   up, down",
-    "Q E   turn      T G, Z X   tilt",
-    "SPACE   open or close the hand",
-    "ENTER   judge from here; record",
-    "BACKSPACE   new start     ESC   quit",
-)
-SIZE = 600
-DEMONSTRATION = "a8 w6 f7 wait4 r4 space wait10"
-"""What is played without a display and without ``--keys``: the LED's button is pressed, the hand closes."""
+_SHORTEST = 32
+_PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each frame 1.58 times
+_LATEST = 10  # frames after the fulfilment at which a window ends at the latest
 
 
-@dataclass
-class PlayConfig:
-    """Opens a desk for driving by keyboard; without a display, writes a video of given keys instead."""
+def record_play(
+    desk: Desk,
+    frames: int,
+    rng: np.random.Generator,
+    writer: FrameWriter,
+    noise: float,
+    variety: float,
+    whole: bool = False,
+) -> Unit:
+    """Plays for `frames` control steps and writes all of them.
 
-    scene: str = "D"
-    # The `data` folder of a calvin_env checkout; the built-in desk by default.
-    assets: str | None = None
-    # fast, fast_gl, tiny or egl.
-    renderer: str = "fast"
-    # Start in a random state from which this task can be done; everything closed and off by default.
-    task: str | None = None
-    seed: int = 0
-    # Keep demonstrations here, in CALVIN's format: ENTER begins one, ENTER after a fulfilled task keeps it.
-    output_dir: Path | None = None
-    # Keys to press instead of a keyboard: 'd10 f5 space wait20 enter', a number for how many steps each is held.
-    keys: str | None = None
-    # Write what is seen to this mp4; play.mp4 when keys are played or there is no display.
-    video: Path | None = None
-
-    def check(self) -> None:
-        """Raises DeskError for options that cannot be carried out."""
-        if self.task is not None and self.task not in TASKS:
-            raise DeskError(f"--task={self.task} is unknown; choose among: {', '.join(TASKS)}")
-        if self.output_dir is not None and (self.output_dir / "training").exists():
-            raise DeskError(
-                f"--output_dir={self.output_dir} already holds a recording; choose another folder"
-            )
-        if self.seed < 0:
-            raise DeskError(f"--seed={self.seed}: expected 0 or more")
-        list(parse_keys(self.keys or ""))
-
-
-class Session:
-    """A desk driven by keys, with everything fulfilled since the last mark.
+    A task is chosen among those that are feasible, carried out, and followed by a moment of rest. When a block fell
+    off the desk or the physics diverged, the desk is reset to a random state and a new recording begins.
 
     Args:
-        config: The command's options.
-        desk: With both cameras.
+        desk: Any desk; the frames hold the pictures of its cameras.
+        frames: How many to record.
+        rng: Decides everything.
+        writer: Receives the frames.
+        noise, variety: As for `demonstrator.demonstrate`.
+        whole: The windows are whole subtasks instead of CALVIN's.
+
+    Returns:
+        What was recorded: stretches between resets, and the windows with their tasks.
     """
-
-    def __init__(self, config: PlayConfig, desk: Desk):
-        self.config, self.desk = config, desk
-        self.kept: list[tuple[Path, Unit, list[str]]] = []
-        self.recording = False
-        self._commands = load_commands(None, "training")
-        self._starts = config.seed
-        self.begin()
-
-    def begin(self) -> None:
-        """A new start state."""
-        rng = np.random.default_rng(self._starts)
-        if self.config.task is None:
-            self.obs = self.desk.reset(seed=self._starts)
-        else:
-            self.obs = self.desk.reset(*sample_start(self.desk, self.config.task, rng))
-        self._starts += 1
-        self._target = self.obs["robot_obs"][:6].copy()
-        self._gripper = float(self.obs["robot_obs"][14])
-        self.mark()
-        self.recording = False
-
-    def mark(self) -> None:
-        """From here on the oracle judges, and a recording begins."""
-        self.fulfilled: dict[str, int] = {}
-        self.steps = 0
-        self._start = self.desk.snapshot()
-        self._rows: list[dict[str, np.ndarray]] = []
-
-    def press(self, key: str) -> None:
-        """A key that is pressed rather than held: space, enter, backspace."""
-        if key == "space":
-            self._gripper = -self._gripper
-        elif key == "backspace":
-            self.begin()
-        elif key == "enter":
-            if self.recording and self.fulfilled and self.config.output_dir is not None:
-                self._keep(self.config.output_dir)  # of what still holds
-            self.recording = not self.recording and self.config.output_dir is not None
-            self.mark()
-
-    def step(self, held: Iterable[str] = ()) -> Observation:
-        """One control step with the given keys of :data:`MOVES` held down."""
-        pose = self.obs["robot_obs"][:6]
-        units = np.array([POSITION_STEP] * 3 + [ANGLE_STEP] * 3)
-        for key in held:
-            axis, direction = MOVES[key]
-            self._target[axis] = pose[axis] + direction * units[axis]
-        action = np.append(self._target, self._gripper)
-        action[3:6] = (action[3:6] + np.pi) % (2 * np.pi) - np.pi
-        if self.recording:
-            relative = relative_action(action, self.obs["robot_obs"])
-            self._rows.append({**self.obs, "actions": action, "rel_actions": relative})
-        self.steps += 1
-        self.obs = self.desk.step(action, control_mode="abs")
-        now = self.desk.completed_tasks(self._start)
-        self.fulfilled = {task: self.fulfilled.get(task, self.steps) for task in sorted(now)}
-        return self.obs
-
-    def _keep(self, output: Path) -> None:
-        asked = self.config.task
-        task = (
-            asked if asked in self.fulfilled else max(self.fulfilled, key=lambda name: self.fulfilled[name])
-        )
-        assert task is not None
-        folder = output / ".playing" / f"{len(self.kept):06d}"
-        with FrameWriter(folder, self.desk.scene) as writer:
-            for row in self._rows:
-                writer.add(row)
-        n = len(self._rows)
-        unit = Unit(self.desk.scene.name, n, [(0, n)], [(0, n, task)], sums=writer.sums())
-        self.kept.append((folder, unit, [self._commands[task][0]]))
-
-    def finish(self) -> None:
-        """Publishes the demonstrations kept as OUTPUT_DIR/training; to be called however the session ended."""
-        output = self.config.output_dir
-        if output is None:
-            return
-        if self.kept:
-            details = {key: str(value) for key, value in asdict(self.config).items()} | {
-                "control_hz": CONTROL_HZ
-            }
-            publish_split(output / "training", self.kept, 0, details, {})
-            print(f"{len(self.kept)} demonstrations in {output}")
-        shutil.rmtree(output / ".playing", ignore_errors=True)
-
-    def picture(self) -> np.ndarray:
-        """What the player sees, (600, 900, 3) uint8: both cameras, verdicts and keys."""
-        canvas = Image.new("RGB", (SIZE * 3 // 2, SIZE), (24, 26, 30))
-        canvas.paste(Image.fromarray(self.desk.render("static", SIZE)), (0, 0))
-        canvas.paste(Image.fromarray(self.desk.render("gripper", SIZE // 2)), (SIZE, 0))
-        draw = ImageDraw.Draw(canvas)
-        x, y = SIZE + 12, SIZE // 2 + 10
-        if self.recording:
-            draw.text((x, y), f"RECORDING, {self.steps} frames", (255, 90, 90), _font(15))
-        else:
-            draw.text((x, y), f"{self.steps / CONTROL_HZ:.1f} s", (200, 200, 200), _font(15))
-        if self.kept:
-            draw.text((x + 190, y), f"{len(self.kept)} kept", (200, 200, 200), _font(15))
-        listed = sorted(self.fulfilled.items(), key=lambda item: -item[1])
-        for line, (task, step) in enumerate(listed[:5]):
-            draw.text(
-                (x, y + 26 + 22 * line), f"{task}  {step / CONTROL_HZ:.1f} s", (110, 230, 120), _font(15)
-            )
-        if not listed:
-            draw.text((x, y + 26), "nothing fulfilled yet", (140, 140, 140), _font(15))
-        for line, text in enumerate(HELP):
-            draw.text((x, SIZE - 18 * (len(HELP) - line) - 6), text, (150, 150, 150), _font(13))
-        return np.asarray(canvas)
-
-
-def _font(size: int) -> Any:
-    return ImageFont.load_default(size)
-
-
-def parse_keys(text: str) -> Iterator[tuple[str, int]]:
-    """``'d10 space wait5'`` as (key, steps).
-
-    Raises:
-        DeskError: A word that is no key.
-    """
-    for word in text.split():
-        match = re.fullmatch(r"([a-z]+?)(\d*)", word)
-        if match is None or match[1] not in (*MOVES, "space", "enter", "backspace", "wait"):
-            raise DeskError(
-                f"--keys: {word!r} is none of {', '.join(MOVES)}, space, enter, backspace, wait, with a number of "
-                "steps behind it"
-            )
-        yield match[1], int(match[2] or 1)
-
-
-class _Video:
-    """An mp4 that grows with each frame and appears when it is complete."""
-
-    def __init__(self, path: Path):
-        import av
-
-        self._path, self._partial = path, path.with_name(f".{path.name}.partial.mp4")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(self._partial), "w")
-        self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ)
-        self._stream.width, self._stream.height, self._stream.pix_fmt = SIZE * 3 // 2, SIZE, "yuv420p"
-        self._frame = av.VideoFrame.from_ndarray
-
-    def add(self, picture: np.ndarray) -> None:
-        self._container.mux(self._stream.encode(self._frame(picture, format="rgb24")))
-
-    def __enter__(self) -> "_Video":
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._container.mux(self._stream.encode())
-        self._container.close()
-        if kind is None:
-            self._partial.replace(self._path)
-            print(f"video: {self._path}")
-        else:
-            self._partial.unlink(missing_ok=True)
-
-
-def play_keys(session: Session, keys: str, video: _Video | None) -> None:
-    """Presses the given keys one after the other."""
-    for key, steps in tqdm(list(parse_keys(keys)), desc="playing", unit="key"):
-        if key in ("space", "enter", "backspace"):
-            session.press(key)
-            steps, key = 1, "wait"
-        for _ in range(steps):
-            session.step(() if key == "wait" else (key,))
-            if video is not None:
-                video.add(session.picture())
-
-
-def play_window(session: Session, pygame: Any, video: _Video | None) -> None:
-    """Drives by keyboard until ESC or the window's closing."""
-    window = pygame.display.set_mode((SIZE * 3 // 2, SIZE))
-    pygame.display.set_caption(f"CALVIN desk, scene {session.desk.scene.name}")
-    pressed = {pygame.K_SPACE: "space", pygame.K_RETURN: "enter", pygame.K_BACKSPACE: "backspace"}
-    clock = pygame.time.Clock()
-    while True:
-        for event in pygame.event.get():
-            if event.type == pygame.QUIT or (event.type == pygame.KEYDOWN and event.key == pygame.K_ESCAPE):
-                return
-            if event.type == pygame.KEYDOWN and event.key in pressed:
-                session.press(pressed[event.key])
-        state = pygame.key.get_pressed()
-        session.step([key for key in MOVES if state[pygame.key.key_code(key)]])
-        picture = session.picture()
-        window.blit(pygame.surfarray.make_surface(picture.swapaxes(0, 1)), (0, 0))
-        pygame.display.flip()
-        if video is not None:
-            video.add(picture)
-        clock.tick(CONTROL_HZ)
-
-
-def open_window() -> Any | None:
-    """pygame with a display, or None (and a sentence why) when there is none."""
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        import pygame
-    except ImportError:
-        print("no window without pygame: pip install 'lerobot_policy_lansar[play]'", file=sys.stderr)
-        return None
-    asked = os.environ.get("SDL_VIDEODRIVER")
-    if sys.platform == "linux" and not asked and not ({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)):
-        print("no window without a display: playing keys into a video", file=sys.stderr)
-        return None
-    try:
-        pygame.display.init()
-    except pygame.error as error:
-        print(f"no window ({error}): playing keys into a video", file=sys.stderr)
-        return None
-    return pygame
-
-
-def play(config: PlayConfig) -> Session:
-    """Runs the command; returns the session as it ended.
-
-    Raises:
-        DeskError: An option cannot be carried out.
-    """
-    config.check()
-    pygame = open_window() if config.keys is None else None
-    path = config.video
-    if path is None and pygame is None:
-        path = Path("play.mp4")
-    with Desk(config.scene, config.assets, renderer=config.renderer) as desk:
-        session = Session(config, desk)
-        if config.output_dir is not None:  # of a session that was killed
-            shutil.rmtree(config.output_dir / ".playing", ignore_errors=True)
-        recorder: AbstractContextManager[_Video | None] = _Video(path) if path else nullcontext()
+    unit = Unit(desk.scene.name)
+    while writer.frames < frames:
+        start, snapshots, fulfilled = writer.frames, [], []
         try:
-            with recorder as video:
-                if pygame is None:
-                    play_keys(session, config.keys or DEMONSTRATION, video)
-                else:
-                    play_window(session, pygame, video)
-                    pygame.quit()
-        finally:
-            session.finish()
-        print(f"fulfilled: {', '.join(session.fulfilled) or 'nothing'}")
-    return session
+            for frame, snapshot, done in _play(desk, frames - start, rng, noise, variety, unit, whole):
+                writer.add(frame)
+                snapshots.append(snapshot)
+                if done is not None:
+                    began, task = done
+                    fulfilled.append((began, len(snapshots) - 1, task))
+        except SimulationError:
+            pass
+        if snapshots:
+            unit.recordings.append((start, writer.frames))
+            cut = whole_windows(snapshots, fulfilled) if whole else cut_windows(snapshots, fulfilled, rng)
+            for first, end, task in cut:
+                unit.windows.append((start + first, start + end, task))
+    unit.frames, unit.sums = writer.frames, writer.sums()
+    return unit
 
 
-def main() -> None:
-    """Entry point of ``lansar-play``."""
-    try:
-        play(draccus.parse(PlayConfig))
-    except (DeskError, SimulationError, OSError, draccus.utils.ParsingError) as error:
-        print(f"lansar-play: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+def _play(
+    desk: Desk,
+    frames: int,
+    rng: np.random.Generator,
+    noise: float,
+    variety: float,
+    unit: Unit,
+    whole: bool,
+) -> Iterator[tuple[dict[str, np.ndarray], Snapshot, tuple[int, str] | None]]:
+    """One uninterrupted recording. Yields each frame, its snapshot, and of the task first seen fulfilled in it the
+    frame in which it was begun and its name.
+    """
+    obs = desk.reset(*sample_start(desk, str(rng.choice(list(TASKS))), rng))
+    last, before = desk.snapshot(), None
+    left, carried_out = frames, 0
+    while left > 0:
+        tasks = feasible_tasks(desk.scene, last, obs)
+        skill: Skill
+        oracle: Condition
+        if tasks:
+            task = _choose(tasks, before, rng)
+            unit.tried[task] = unit.tried.get(task, 0) + 1
+            skill, oracle, before = SKILLS[task], partial(is_fulfilled, task), task
+        else:
+            task, skill, oracle = "", put_down, _never
+        start, began, done = last, frames - left, False
+        rest = int(rng.integers(1, 6) if whole else rng.integers(2, 20))
+        for moves, limit, stop in ((skill, STEPS_PER_COMMAND, oracle), (_resting, rest, _never)):
+            steps = carry_out(
+                desk,
+                obs,
+                moves,
+                rng,
+                variety=variety,
+                noise=noise,
+                steps=min(left, limit),
+                fulfilled=partial(stop, start),
+            )
+            for frame, after, now in steps:
+                first = not done and oracle(start, last)
+                done = done or first
+                yield frame, last, (began, task) if first else None
+                obs, last, left = after, now, left - 1
+        if done:
+            unit.accepted[task] = unit.accepted.get(task, 0) + 1
+        carried_out += 1
+        if any(block.position[2] < 0.30 for block in last.blocks.values()):
+            return
+        if whole and (not done or carried_out == CHAIN_LENGTH):
+            return
 
 
-if __name__ == "__main__":
-    main()
+def _never(start: Snapshot, end: Snapshot) -> bool:
+    return False
+
+
+def _resting(view: View) -> Iterator[Waypoint]:
+    """Stay where you are, with the hand as it is."""
+    yield view.go(
+        view.tcp.copy(), float(view.robot_obs[GRIPPER_ACTION]), view.robot_obs[3:6].copy(), hold=STEPS_PER_COMMAND
+    )
+
+
+def _choose(tasks: list[str], before: str | None, rng: np.random.Generator) -> str:
+    """One of the tasks: kinds of task are equally likely, not tasks, and none comes twice in a row if others can."""
+    kinds: dict[tuple[str, str], list[str]] = {}
+    for task in tasks:
+        if task != before or len(tasks) == 1:
+            kinds.setdefault((TASKS[task].kind, TASKS[task].place or ""), []).append(task)
+    listed = kinds[sorted(kinds)[rng.choice(len(kinds))]]
+    return str(rng.choice(listed))
+
+
+def _held(snapshot: Snapshot) -> str | None:
+    return next((color for color, block in snapshot.blocks.items() if block.bodies == {"robot"}), None)
+
+
+def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[str]:
+    """The tasks that can begin now, by CALVIN's rules (a block in the hand can only be placed or stacked) and by what
+    a hand can reach.
+
+    Args:
+        scene: The desk's scene.
+        snapshot, obs: The present state.
+    """
+    held = _held(snapshot)
+    view = View(scene, obs["robot_obs"], obs["scene_obs"], np.random.default_rng(0), Style())
+    on_table = [c for c in COLORS if _free_on_table(view, snapshot, c)]
+    slide, drawer = snapshot.slide, snapshot.drawer
+    at_end = min(slide, scene.slide_travel - slide) < 0.03
+    if held is not None:
+        if not view.holds(held):
+            return []  # it hangs on the hand somehow
+        others = [c for c in on_table if c != held]
+        return [
+            *(["place_in_slider"] if at_end else []),
+            *(["place_in_drawer"] if drawer > 0.15 else []),
+            *(["stack_block"] if others else []),
+        ]
+    tasks = [
+        *(["move_slider_left"] if scene.slide_travel - slide > 0.16 else []),
+        *(["move_slider_right"] if slide > 0.16 else []),
+        *(["open_drawer"] if DRAWER_TRAVEL - drawer > 0.13 else []),
+        *(["close_drawer"] if drawer > 0.13 else []),
+        "turn_off_lightbulb" if snapshot.bulb else "turn_on_lightbulb",
+        "turn_off_led" if snapshot.led else "turn_on_led",
+    ]
+    switch = view.scene_obs[SWITCH]
+    if snapshot.bulb != (switch > SWITCH_TRAVEL / 2):
+        tasks.remove("turn_off_lightbulb" if snapshot.bulb else "turn_on_lightbulb")
+    for color in on_table:
+        tasks.append(f"lift_{color}_block_table")
+        tasks += [f"rotate_{color}_block_{side}" for side in ("left", "right")]
+        for side, sign in (("left", -1), ("right", 1)):
+            if abs(view.block(color)[0] + sign * 0.11) < REACH:
+                tasks.append(f"push_{color}_block_{side}")
+    if drawer > 0.15 and any(abs(view.block(c)[0] - scene.drawer_x) < 0.3 for c in on_table):
+        tasks.append("push_into_drawer")
+    for color in COLORS:
+        block, (x, y, z) = snapshot.blocks[color], view.block(color)[:3]
+        beside = beside_door(scene, slide, x)
+        flat = lying(view.block(color))[1]
+        if PLANK in block.contacts and not _under_another(snapshot, color) and beside and y < 0.125 and flat:
+            tasks.append(f"lift_{color}_block_slider")
+        if DRAWER in block.contacts and not _under_another(snapshot, color) and y < -0.215 and z < TABLE_Z - 0.05:
+            tasks.append(f"lift_{color}_block_drawer")
+    if any(is_stacked(block) for block in snapshot.blocks.values()):
+        tasks.append("unstack_block")
+    return tasks
+
+
+def _free_on_table(view: View, snapshot: Snapshot, color: str) -> bool:
+    block, pose = snapshot.blocks[color], view.block(color)
+    on_it = block.contacts == {TABLE} and abs(pose[2] - TABLE_Z) < 0.03
+    return bool(on_it and abs(pose[0]) < REACH and -0.19 < pose[1] < 0.0)
+
+
+def _under_another(snapshot: Snapshot, color: str) -> bool:
+    position = snapshot.blocks[color].position
+    above = [snapshot.blocks[c].position - position for c in COLORS if c != color]
+    return any(gap[2] > 0.03 and np.linalg.norm(gap[:2]) < 0.05 for gap in above)
+
+
+def whole_windows(snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]]) -> list[tuple[int, int, str]]:
+    """Windows from the frame in which a task was begun until it is, and for some frames has been, fulfilled: what a
+    policy has to do in a rollout of several subtasks, from where the one before left the desk.
+
+    Args:
+        snapshots: Of each frame of one recording.
+        fulfilled: (began, frame, task): when tasks were begun and first seen fulfilled.
+
+    Returns:
+        (first, end, task) with an exclusive end, in order. Tasks that did not stay fulfilled give none.
+    """
+    return [
+        (began, frame + 1 + AFTERWARDS, task)
+        for began, frame, task in fulfilled
+        if frame + AFTERWARDS < len(snapshots)
+        and all(is_fulfilled(task, snapshots[began], now) for now in snapshots[frame : frame + 1 + AFTERWARDS])
+    ]
+
+
+def cut_windows(
+    snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]], rng: np.random.Generator
+) -> list[tuple[int, int, str]]:
+    """Windows of at most 64 frames between whose first and last frame exactly one task was fulfilled.
+
+    Args:
+        snapshots: Of each frame of one recording.
+        fulfilled: (began, frame, task): when tasks were begun and first seen fulfilled.
+        rng: Decides where windows begin and end around these frames.
+
+    Returns:
+        (first, end, task) with an exclusive end, in order; windows may overlap. Tasks that took longer than a window,
+        or cannot be told from another one, give none.
+    """
+    windows = set()
+    for _, frame, task in fulfilled:
+        found = 0
+        for attempt in range(8):
+            latest = min(frame + 1 + _LATEST, len(snapshots))
+            end = int(rng.integers(frame + 1, latest + 1))
+            length = WINDOW_FRAMES if attempt % 2 else int(rng.integers(_SHORTEST, WINDOW_FRAMES + 1))
+            first = max(end - length, 0)
+            if completed_tasks(snapshots[first], snapshots[end - 1]) == {task}:
+                windows.add((first, end, task))
+                found += 1
+            if found == _PER_TASK:
+                break
+    return sorted(windows)

@@ -1,13 +1,8 @@
-"""``lansar-record``: scripted demonstrations on the desk, in CALVIN's own on-disk format."""
+"""`lansar-record`: scripted demonstrations on the desk, in CALVIN's own on-disk format."""
 
-import contextlib
-import json
-import shlex
 import shutil
-import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -15,21 +10,27 @@ from typing import NamedTuple
 
 import draccus
 import numpy as np
-from filelock import FileLock, Timeout
 
-from ..desk import CONTROL_HZ, SCENES, Desk, DeskError, SimulationError
-from ..desk.commands import load_commands
-from ..executors import SlurmConfig, WorkerDied, check_executor, run_shards
+from ..calvin import CONTROL_HZ
+from ..command import run_command
+from ..desk import SCENES, Desk, DeskError, SimulationError
+from ..desk.sentences import load_commands
+from ..jobs.executors import check_executor, run_shards
+from ..jobs.staging import staging
+from ..jobs.work import SlurmConfig
 from .calvin_folder import FrameWriter, Unit, group_by_scene, publish_split
 from .demonstrator import Demonstration, demonstrate
-from .play_data import record_play
+from .play import record_play
 from .skills import SKILLS
 
 ATTEMPTS = 20
 SPLITS = ("training", "validation")
 MODES = ("windows", "play", "chains")
 STAGING = ".recording"
-SUBMITTED, PUBLISHING = "submitted", "publishing"  # marks in the staging folder
+NOTES = "[0-9]*.json"
+"""What the staging folder holds of each finished unit."""
+PUBLISHING = "publishing"
+"""A mark in the staging folder: splits are being put into their place."""
 SLURM_LOGS = ".recording-slurm"
 """Where Slurm's jobs keep their logs; they outlive the staging folder."""
 
@@ -109,9 +110,7 @@ class RecordConfig:
             if not 0.1 <= getattr(self, name) * minutes <= 1e6:
                 raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
         if self.mode != "windows" and self.tasks != list(SKILLS):
-            raise DeskError(
-                f"--tasks goes with --mode=windows; --mode={self.mode} carries out whatever is feasible"
-            )
+            raise DeskError(f"--tasks goes with --mode=windows; --mode={self.mode} carries out whatever is feasible")
 
     @property
     def scenes(self) -> list[str]:
@@ -149,7 +148,7 @@ class RecordConfig:
 
 
 def record(config: RecordConfig) -> Path:
-    """Records what ``config`` asks for; an interrupted recording goes on where it stopped.
+    """Records what `config` asks for; an interrupted recording goes on where it stopped.
 
     Unit k of a split (an episode, or a session of play) depends on the request, split and k alone, so the data are the
     same for any number of workers. Finished units wait in OUTPUT_DIR/.recording; the splits appear at the end, each in
@@ -168,31 +167,24 @@ def record(config: RecordConfig) -> Path:
             load_commands(_annotations(config, split), split)
         except DeskError as error:
             raise DeskError(f"--{option}: {error}") from error
-    output, staging = config.output_dir, config.output_dir / STAGING
+    output, folder = config.output_dir, config.output_dir / STAGING
     _check_target(output)
-    output.mkdir(parents=True, exist_ok=True)
-    with _locked(output):
+    slurm = config.executor == "slurm"
+    with staging(folder, output, config.request(), _has_units, submitting=slurm):
         _check_target(output)  # another process may have finished meanwhile
-        _claim(staging, config)
-        if config.executor == "slurm":
-            (staging / SUBMITTED).touch()
         total = sum(config.counts())
-        try:
-            done = run_shards(
-                (record_shard, (config,)),
-                -(-total // config.shard_size()),
-                (publish, (config, kinds.pop())),
-                executor=config.executor,
-                workers=config.workers,
-                slurm=config.slurm,
-                logging_dir=output / SLURM_LOGS if config.executor == "slurm" else staging / "jobs",
-                progress=lambda: len(list(staging.glob("[0-9]*.json"))),
-                total=total,
-                unit="episode" if config.mode == "windows" else "session",
-            )
-        except BaseException:
-            (staging / SUBMITTED).unlink(missing_ok=True)  # nothing is on its way
-            raise
+        done = run_shards(
+            (record_shard, (config,)),
+            -(-total // config.shard_size()),
+            (publish, (config, kinds.pop())),
+            executor=config.executor,
+            workers=config.workers,
+            slurm=config.slurm,
+            logging_dir=output / SLURM_LOGS if slurm else folder / "jobs",
+            progress=lambda: len(list(folder.glob(NOTES))),
+            total=total,
+            unit="episode" if config.mode == "windows" else "session",
+        )
     if not done:
         print(f"submitted; {output / SPLITS[0]} and {output / SPLITS[1]} appear when the jobs are done")
     return output
@@ -210,19 +202,19 @@ def _with_absolute_paths(config: RecordConfig) -> RecordConfig:
 
 def _check_target(output: Path) -> None:
     """Raises DeskError when there is something that must not be replaced, or jobs are still on their way."""
-    staging = output / STAGING
+    folder = output / STAGING
     found = [split for split in SPLITS if (output / split).exists()]
     if len(found) == len(SPLITS):
-        shutil.rmtree(staging, ignore_errors=True)  # a run may have ended while it tidied up
-    if found and not (staging / PUBLISHING).exists():
+        shutil.rmtree(folder, ignore_errors=True)  # a run may have ended while it tidied up
+    if found and not (folder / PUBLISHING).exists():
         raise DeskError(
             f"{output} already holds a recording ({', '.join(found)}); give another --output_dir or delete it first"
         )
-    if (staging / SUBMITTED).exists():
-        raise DeskError(
-            f"Slurm jobs for {output} were submitted already; wait for them, or cancel them and delete "
-            f"{staging / SUBMITTED} to submit what is missing"
-        )
+
+
+def _has_units(folder: Path) -> bool:
+    """Whether a staging folder holds units of an interrupted recording."""
+    return any(folder.glob(NOTES))
 
 
 def record_shard(config: RecordConfig, shard: int) -> None:
@@ -299,30 +291,28 @@ def _note(config: RecordConfig, index: int) -> Path:
 
 def publish(config: RecordConfig, kind: str, _: int) -> None:
     """Builds both splits from the recorded units, prints the summary and removes the staging folder."""
-    output, staging = config.output_dir, config.output_dir / STAGING
+    output, folder = config.output_dir, config.output_dir / STAGING
     details = {**config.request(), "assets_used": kind, "control_hz": CONTROL_HZ}
-    benchmark = {
-        task: listed[0] for task, listed in load_commands(config.validation_annotations, "validation").items()
-    }
+    benchmark = {task: listed[0] for task, listed in load_commands(config.validation_annotations, "validation").items()}
     training, validation = config.counts()
     units = [Unit.load(_note(config, index)) for index in range(training + validation)]
-    (staging / PUBLISHING).touch()
+    (folder / PUBLISHING).touch()
     frame = 0
     parts = range(training), range(training, training + validation)
     for number, (split, indices) in enumerate(zip(SPLITS, parts, strict=True)):
         commands = load_commands(_annotations(config, split), split)
         rows = [
-            (staging / f"{index:06d}", units[index], _say(commands, units[index], [config.seed, number, k]))
+            (folder / f"{index:06d}", units[index], _say(commands, units[index], [config.seed, number, k]))
             for k, index in enumerate(indices)
         ]
         shutil.rmtree(output / split, ignore_errors=True)  # of a try that ended between the two
         frame = publish_split(output / split, rows, frame, details, benchmark)
-    shutil.rmtree(staging)
+    shutil.rmtree(folder)
     print(summary(config, units))
 
 
 def _say(commands: dict[str, list[str]], unit: Unit, seed: list[int]) -> list[str]:
-    """A random sentence for each of a unit's windows; ``seed`` says which unit of which split."""
+    """A random sentence for each of a unit's windows; `seed` says which unit of which split."""
     rng = np.random.default_rng([*seed, ATTEMPTS])
     return [commands[task][int(rng.integers(len(commands[task])))] for *_, task in unit.windows]
 
@@ -353,64 +343,25 @@ def summary(config: RecordConfig, units: list[Unit]) -> str:
     return "\n".join(lines)
 
 
-@contextlib.contextmanager
-def _locked(output: Path) -> Iterator[None]:
-    """Keeps a second process out of ``output``; the lock ends with its process, however it ends."""
-    file = output / ".recording.lock"
-    try:
-        with FileLock(file, timeout=0):
-            yield
-            file.unlink(missing_ok=True)
-    except Timeout:
-        raise DeskError(f"another process is recording into {output}") from None
-
-
 def _look(config: RecordConfig, scene: str) -> str:
     """The kind of assets; fails early when scene, assets or cameras are not to be had."""
     with Desk(scene, config.assets, config.cameras, config.renderer) as desk:
         return desk.assets
 
 
-def _claim(staging: Path, config: RecordConfig) -> None:
-    """Makes the staging folder ours, or goes on with one that was begun with the same options."""
-    staging.mkdir(exist_ok=True)
-    file = staging / "request.json"
-    request = json.loads(json.dumps(config.request()))
-    if file.exists() and json.loads(file.read_text()) == request:
-        for leftover in staging.glob("*.partial"):  # of processes that were killed
-            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        return
-    if file.exists() and any(staging.glob("[0-9]*.json")):
-        raise DeskError(
-            f"{staging} holds a recording that was begun with other options; delete it, or repeat the options of {file}"
-        )
-    shutil.rmtree(staging.parent / SLURM_LOGS, ignore_errors=True)  # it remembers shards of another recording
-    for leftover in staging.iterdir():  # without its request nothing tells what these units are
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-    partial = file.with_suffix(".partial")
-    partial.write_text(json.dumps(request, indent=1))
-    partial.rename(file)
+@draccus.wrap()
+def run(config: RecordConfig) -> None:
+    """Records."""
+    record(config)
 
 
-def main() -> None:
-    """Entry point of ``lansar-record``."""
-    try:
-        record(draccus.parse(RecordConfig))
-    except (ValueError, WorkerDied, OSError, draccus.utils.ParsingError) as error:
-        print(f"lansar-record: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except subprocess.CalledProcessError as error:
-        print(
-            f"lansar-record: error: {shlex.join(error.cmd)} failed: {error.stderr or error}", file=sys.stderr
-        )
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("lansar-record: interrupted; the same command goes on where it stopped", file=sys.stderr)
-        sys.exit(130)
+def main() -> int:
+    """Entry point of `lansar-record`."""
+    return run_command("lansar-record", run, resumable=True)
 
 
 if __name__ == "__main__":
     # workers on other machines know these functions by their module's real name
-    from lerobot_lansar.demos.record import main as run
+    from lerobot_lansar.demos.record import main as run_main
 
-    run()
+    sys.exit(run_main())

@@ -1,15 +1,12 @@
 """The CALVIN desk on PyBullet: physics, cameras and the 34-task oracle. Needs neither LeRobot nor torch."""
 
-from .desk import CONTROL_HZ, Desk, Observation
+from .desk import Desk, Observation
 from .errors import DeskError, SimulationError
-from .oracle import TASKS, BlockState, Snapshot, completed_tasks
-from .scenes import COLORS, SCENES
+from .oracle import BlockState, Snapshot, completed_tasks, is_fulfilled
+from .scenes import SCENES
 
 __all__ = [
-    "COLORS",
-    "CONTROL_HZ",
     "SCENES",
-    "TASKS",
     "BlockState",
     "Desk",
     "DeskError",
@@ -17,4 +14,5 @@ __all__ = [
     "SimulationError",
     "Snapshot",
     "completed_tasks",
+    "is_fulfilled",
 ]

@@ -1,4 +1,4 @@
-"""Where a desk's bodies come from: a CALVIN checkout's ``data`` folder, or URDFs generated from a scene's numbers."""
+"""Where a desk's bodies come from: a CALVIN checkout's `data` folder, or URDFs generated from a scene's numbers."""
 
 import re
 import tempfile
@@ -19,7 +19,7 @@ class Assets:
     """URDF files of one scene, ready to load.
 
     Attributes:
-        kind: ``"built-in"`` or ``"original"``; every results file states it.
+        kind: `"built-in"` or `"original"`; every results file states it.
         scale: Global scaling to load the desk and the blocks with.
         temporary: The files go away once they are loaded.
     """
@@ -35,10 +35,10 @@ class Assets:
 
 @contextmanager
 def open_assets(scene: Scene, folder: str | Path | None) -> Iterator[Assets]:
-    """Assets of ``scene``: those in ``folder``, or built-in ones (written to a temporary folder) when it is None.
+    """Assets of `scene`: those in `folder`, or built-in ones (written to a temporary folder) when it is None.
 
     Raises:
-        DeskError: ``folder`` lacks a file that the scene needs.
+        DeskError: `folder` lacks a file that the scene needs.
     """
     if folder is not None:
         yield _original(scene, Path(folder))
@@ -46,9 +46,7 @@ def open_assets(scene: Scene, folder: str | Path | None) -> Iterator[Assets]:
     with tempfile.TemporaryDirectory(prefix="lansar_desk_") as name:
         path = Path(name)
         files = builtin.write(scene, path)
-        yield Assets(
-            "built-in", path / "robot.urdf", path / "desk.urdf", path / "plane.urdf", files, 1.0, True
-        )
+        yield Assets("built-in", path / "robot.urdf", path / "desk.urdf", path / "plane.urdf", files, 1.0, True)
 
 
 def _original(scene: Scene, folder: Path) -> Assets:
@@ -78,9 +76,7 @@ def _check(file: Path, scene: Scene) -> None:
         )
     with file.open("rb") as content:
         if content.read(len(_LFS)) == _LFS:
-            raise DeskError(
-                f"asset file {file} is a Git LFS pointer: run `git lfs pull` in the calvin_env checkout"
-            )
+            raise DeskError(f"asset file {file} is a Git LFS pointer: run `git lfs pull` in the calvin_env checkout")
     material = file.with_suffix(".mtl")
     if file.suffix.lower() == ".obj" and material.is_file():
         for texture in re.findall(r"^\s*map_Kd\s+(\S+)", material.read_text(), re.MULTILINE):

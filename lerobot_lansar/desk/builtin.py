@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import pybullet_data
 
-from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, BUTTON_TRAVEL, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
+from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, BUTTON_TRAVEL, BUTTON_Y, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
 
 Range = tuple[float, float]
 Color = Sequence[float]
@@ -24,7 +24,7 @@ WHITE, BLACK, FLOOR = (1.0, 1.0, 1.0), (0.08, 0.08, 0.08), (0.78, 0.80, 0.83)
 
 
 def write(scene: Scene, folder: Path) -> dict[str, Path]:
-    """Writes robot.urdf, desk.urdf, plane.urdf and one URDF per block into ``folder``; returns the blocks' files."""
+    """Writes robot.urdf, desk.urdf, plane.urdf and one URDF per block into `folder`; returns the blocks' files."""
     (folder / "robot.urdf").write_text(_robot())
     (folder / "desk.urdf").write_text(_desk(scene, folder))
     (folder / "plane.urdf").write_text(_plane(folder))
@@ -61,7 +61,7 @@ def _box(x: Range, y: Range, z: Range, color: Color) -> str:
 
 
 def _prism(folder: Path, name: str, x: Range, profile: Sequence[tuple[float, float]], color: Color) -> str:
-    """A convex polygon ``profile`` of (y, z), counter-clockwise seen from +x, extruded along ``x``."""
+    """A convex polygon `profile` of (y, z), counter-clockwise seen from +x, extruded along `x`."""
     n = len(profile)
     lines = [f"v {side:.5f} {y:.5f} {z:.5f}" for side in x for y, z in profile]
     for (y0, z0), (y1, z1) in zip(profile, [*profile[1:], profile[0]], strict=True):
@@ -100,8 +100,7 @@ def _joint(
     moves = ""
     if axis is not None:
         moves = (
-            f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
-            f'<limit lower="0" upper="{travel}" effort="0" velocity="0"/>'
+            f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/><limit lower="0" upper="{travel}" effort="0" velocity="0"/>'
         )
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{xyz[0]} {xyz[1]} {xyz[2]}" rpy="{roll} 0 0"/>'
@@ -145,21 +144,31 @@ def _desk(scene: Scene, folder: Path) -> str:
     """CALVIN's desk; link order (so the indices too): button, switch, slide, drawer, led, light, plank."""
     tilted, across = math.radians(60), math.radians(150)  # the cabinet's front leans back by 30 degrees
     joints = [
-        _joint("base__button", "button_link", (scene.button_x, -0.12, 0.46), axis=(0, 0, -1), travel=BUTTON_TRAVEL),
-        _joint("base__switch", "switch_link", (scene.switch_x, 0.0609, 0.4949), roll=across, axis=(0, 0, -1),
-               travel=SWITCH_TRAVEL),
-        _joint("base__slide", "slide_link", (scene.slide_x, 0.075, 0.5353), roll=tilted, axis=(-1, 0, 0),
-               travel=scene.slide_travel),
+        _joint("base__button", "button_link", (scene.button_x, BUTTON_Y, 0.46), axis=(0, 0, -1), travel=BUTTON_TRAVEL),
+        _joint(
+            "base__switch",
+            "switch_link",
+            (scene.switch_x, 0.0609, 0.4949),
+            roll=across,
+            axis=(0, 0, -1),
+            travel=SWITCH_TRAVEL,
+        ),
+        _joint(
+            "base__slide",
+            "slide_link",
+            (scene.slide_x, 0.075, 0.5353),
+            roll=tilted,
+            axis=(-1, 0, 0),
+            travel=scene.slide_travel,
+        ),
         _joint("base__drawer", "drawer_link", (scene.drawer_x, 0.0, 0.32), axis=(0, -1, 0), travel=DRAWER_TRAVEL),
         _joint("base__led", "led_link", (scene.led_x, 0.16, 0.6558)),
         _joint("base__light", "light_link", (scene.light_x, 0.16, 0.6758)),
         _joint("base__plank", "plank_link", (0, 0, 0)),
-    ]  # fmt: skip
+    ]
     links = [
         _link("base_link", 0.0, _base(scene, folder)),
-        _link(
-            "button_link", 0.1538, _shape('<cylinder radius="0.031" length="0.022"/>', BLACK, (0, 0, 0.012))
-        ),
+        _link("button_link", 0.1538, _shape('<cylinder radius="0.031" length="0.022"/>', BLACK, (0, 0, 0.012))),
         _link("switch_link", 0.2388, _switch(scene)),
         _link("slide_link", 1.5435, _slide(scene)),
         _link("drawer_link", 4.2313, _drawer(scene)),
@@ -194,7 +203,7 @@ def _base(scene: Scene, folder: Path) -> str:
         _box(hole, (-0.16, 0.06), (0.30, 0.32), dark),
     ]
     # a low square rim around the button
-    bx, by, inner, outer = scene.button_x, -0.12, 0.032, 0.040
+    bx, by, inner, outer = scene.button_x, BUTTON_Y, 0.032, 0.040
     rim = (0.44, 0.46)
     pieces += [
         _box((bx - outer, bx + outer), (by - outer, by - inner), rim, dark),
@@ -202,7 +211,9 @@ def _base(scene: Scene, folder: Path) -> str:
         _box((bx - outer, bx - inner), (by - inner, by + inner), rim, dark),
         _box((bx + inner, bx + outer), (by - inner, by + inner), rim, dark),
     ]
-    legs = [_box(x, y, (0.0, 0.40), wood) for x in ((-0.44, -0.40), (0.40, 0.44)) for y in ((-0.18, -0.148), (0.148, 0.18))]  # fmt: skip  # noqa: E501
+    legs = [
+        _box(x, y, (0.0, 0.40), wood) for x in ((-0.44, -0.40), (0.40, 0.44)) for y in ((-0.18, -0.148), (0.148, 0.18))
+    ]
     return "".join(pieces + legs)
 
 
@@ -277,9 +288,7 @@ def _robot() -> str:
     pad_contact = '<contact><lateral_friction value="1"/><spinning_friction value="0.001"/></contact>'
     for side, sign in (("left", 1), ("right", -1)):
         pad = _box((-0.0093, 0.0093), tuple(sorted((sign * 0.0009, sign * 0.0049))), (0.0707, 0.0957), BLACK)  # type: ignore[arg-type]
-        extra.append(
-            _joint(f"joint_finger_tip_{side}", f"finger_{side}_tip", (0, 0, 0), parent=f"panda_{side}finger")
-        )
+        extra.append(_joint(f"joint_finger_tip_{side}", f"finger_{side}_tip", (0, 0, 0), parent=f"panda_{side}finger"))
         extra.append(_link(f"finger_{side}_tip", 1e-4, pad, pad_contact))
     for element in extra:
         root.append(ElementTree.fromstring(element))

@@ -1,9 +1,11 @@
-"""CALVIN's two cameras (``spec``: eye, target, field of view of calvin_env's config)."""
+"""CALVIN's two cameras (`spec`: eye, target, field of view of calvin_env's config)."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pybullet as p
+
+from ..calvin import CAMERAS
 
 
 @dataclass(frozen=True)
@@ -16,9 +18,9 @@ class Camera:
     far: float
 
 
-CAMERAS = {
-    "static": Camera(size=200, fov=10.0, near=0.01, far=10.0),
-    "gripper": Camera(size=84, fov=75.0, near=0.01, far=2.0),
+INTRINSICS = {
+    "static": Camera(size=CAMERAS["static"], fov=10.0, near=0.01, far=10.0),
+    "gripper": Camera(size=CAMERAS["gripper"], fov=75.0, near=0.01, far=2.0),
 }
 
 STATIC_EYE = (2.871459009488717, -2.166602199425597, 2.555159848480571)

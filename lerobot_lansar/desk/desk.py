@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pybullet as p
 
+from ..calvin import CAMERAS, COLORS, FURNITURE, block_pose
 from .assets import Assets, open_assets
-from .cameras import CAMERAS, gripper_view, static_view
+from .cameras import INTRINSICS, gripper_view, static_view
 from .errors import DeskError, SimulationError
 from .furniture import Table, load_blocks
 from .oracle import BlockState, Snapshot, Touch, completed_tasks
 from .render import RENDERERS, Preparation, Renderer
 from .robot import Robot
-from .scenes import COLORS, Scene, get_scene
+from .scenes import Scene, get_scene
 
-CONTROL_HZ = 30
 SUBSTEPS = 8
 """Simulation steps of 1/240 s per control step of 1/30 s."""
 
@@ -44,21 +44,21 @@ class SavedState:
 class Desk:
     """One simulated desk in a Bullet client of its own.
 
-    ``robot_obs`` (15,) float64 is CALVIN's: TCP xyz (m), TCP euler xyz (rad), gripper opening width (m), seven arm
-    joints (rad), last gripper action (-1 close, +1 open). ``scene_obs`` (24,) float64: slide, drawer, button, switch
+    `robot_obs` (15,) float64 is CALVIN's: TCP xyz (m), TCP euler xyz (rad), gripper opening width (m), seven arm
+    joints (rad), last gripper action (-1 close, +1 open). `scene_obs` (24,) float64: slide, drawer, button, switch
     joints (m), light bulb, LED (0/1), then xyz (m) and euler xyz (rad) of the red, the blue and the pink block: this
     order in every scene, whereas CALVIN's own files follow each scene's configuration.
 
     Args:
-        scene: ``"A"``, ``"B"``, ``"C"``, ``"D"``, or ``"D_eval"``: D with calvin_env's fixed evaluation layout.
-        assets: None for the built-in desk, or the ``data`` folder of a calvin_env checkout for the original files.
-        cameras: Pictures that observations hold: any of ``"static"`` (200x200) and ``"gripper"`` (84x84).
-        renderer: ``"fast"`` (ours, in TinyRenderer's look), ``"fast_gl"`` (ours, in the OpenGL look of CALVIN's public
-            data), ``"tiny"`` or ``"egl"`` (PyBullet's own). It is set up when the first picture is asked for.
-        depth: Observations also hold ``depth_<camera>``.
+        scene: `"A"`, `"B"`, `"C"`, `"D"`, or `"D_eval"`: D with calvin_env's fixed evaluation layout.
+        assets: None for the built-in desk, or the `data` folder of a calvin_env checkout for the original files.
+        cameras: Pictures that observations hold: any of `"static"` (200x200) and `"gripper"` (84x84).
+        renderer: `"fast"` (ours, in TinyRenderer's look), `"fast_gl"` (ours, in the OpenGL look of CALVIN's public
+            data), `"tiny"` or `"egl"` (PyBullet's own). It is set up when the first picture is asked for.
+        depth: Observations also hold `depth_<camera>`.
 
     Raises:
-        DeskError: Unknown scene, camera or renderer, missing asset files, no driver for ``egl``.
+        DeskError: Unknown scene, camera or renderer, missing asset files, no driver for `egl`.
     """
 
     def __init__(
@@ -132,14 +132,14 @@ class Desk:
         Args:
             robot_obs: (15,) joints, opening width and gripper action are used; None: CALVIN's home pose, hand open.
             scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks placed at
-                random by ``seed`` as CALVIN does, or where the scene's layout has them.
-            seed: Decides the blocks' places when ``scene_obs`` is None.
+                random by `seed` as CALVIN does, or where the scene's layout has them.
+            seed: Decides the blocks' places when `scene_obs` is None.
 
         Returns:
             The observation after one simulation step, as in CALVIN.
 
         Raises:
-            DeskError: A state of the wrong length, with a value that is not finite, or over :data:`LARGEST`.
+            DeskError: A state of the wrong length, with a value that is not finite, or over `LARGEST`.
         """
         self._require_open()
         robot_state = None if robot_obs is None else _vector(robot_obs, 15, "robot_obs")
@@ -157,14 +157,14 @@ class Desk:
         """Executes one action for 1/30 s.
 
         Args:
-            action: (7,). ``"rel"``: TCP translation in units of 0.02 m, rotation (euler) in units of 0.05 rad, both
-                added to a target pose that is kept from step to step. ``"abs"``: TCP xyz (m) and euler xyz (rad).
+            action: (7,). `"rel"`: TCP translation in units of 0.02 m, rotation (euler) in units of 0.05 rad, both
+                added to a target pose that is kept from step to step. `"abs"`: TCP xyz (m) and euler xyz (rad).
                 Last number in both: the gripper opens if it is positive, closes otherwise.
-            control_mode: ``"rel"`` or ``"abs"``.
+            control_mode: `"rel"` or `"abs"`.
 
         Raises:
             DeskError: Unknown mode; an action of the wrong shape, with a value that is not finite, or over
-                :data:`LARGEST`. Relative actions beyond 1 are executed as they are, as in CALVIN.
+                `LARGEST`. Relative actions beyond 1 are executed as they are, as in CALVIN.
             SimulationError: The physics diverged; reset before going on.
         """
         self._require_open()
@@ -174,7 +174,7 @@ class Desk:
         return self.observe()
 
     def save(self) -> SavedState:
-        """Remembers the present state for :meth:`restore`, here or on another desk of the same scene and assets."""
+        """Remembers the present state for `restore`, here or on another desk of the same scene and assets."""
         self._require_open()
         return replace(self._history, actions=tuple(self._actions))
 
@@ -198,16 +198,14 @@ class Desk:
         return self.observe()
 
     def observe(self) -> Observation:
-        """The present state: ``robot_obs``, ``scene_obs`` and, per camera, ``rgb_<camera>`` (size, size, 3) uint8 and,
-        if the desk was made with ``depth``, ``depth_<camera>`` (size, size) float32 m.
+        """The present state: `robot_obs`, `scene_obs` and, per camera, `rgb_<camera>` (size, size, 3) uint8 and,
+        if the desk was made with `depth`, `depth_<camera>` (size, size) float32 m.
         """
         self._require_open()
         obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
         if not all(np.isfinite(state).all() for state in obs.values()):
             self._diverged = True
-            raise SimulationError(
-                "the simulation diverged: a state is no longer finite; reset the desk to go on"
-            )
+            raise SimulationError("the simulation diverged: a state is no longer finite; reset the desk to go on")
         for camera in self.cameras:
             obs[f"rgb_{camera}"], inverse = self._draw(camera)
             if self.depth:
@@ -215,7 +213,7 @@ class Desk:
         return obs
 
     def render(self, camera: str = "static", size: int | None = None) -> np.ndarray:
-        """A picture of the present state, (size, size, 3) uint8; ``size`` in pixels, the camera's own by default."""
+        """A picture of the present state, (size, size, 3) uint8; `size` in pixels, the camera's own by default."""
         return self._draw(camera, size)[0]
 
     def render_depth(self, camera: str = "static", size: int | None = None) -> np.ndarray:
@@ -242,7 +240,7 @@ class Desk:
         )
 
     def completed_tasks(self, start: Snapshot) -> set[str]:
-        """Names of CALVIN's tasks that are fulfilled between ``start`` and now."""
+        """Names of CALVIN's tasks that are fulfilled between `start` and now."""
         return completed_tasks(start, self.snapshot())
 
     def solve_ik(self, position: Any, euler: Any, rounds: int = 40) -> np.ndarray:
@@ -282,7 +280,7 @@ class Desk:
             self._renderer = self._pictures.open(self._table.light_colors())
         still = camera == "static"
         view = static_view() if still else gripper_view(*self._robot.camera_pose())
-        lens = CAMERAS[camera]
+        lens = INTRINSICS[camera]
         pixels = lens.size if size is None else size
         if not isinstance(pixels, int | np.integer) or pixels < 1:
             raise DeskError(f"size must be a positive number of pixels, got {size!r}")
@@ -296,9 +294,9 @@ class Desk:
         self._table.update_lights()
 
     def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
-        self._table.reset(scene_state[:6])
+        self._table.reset(scene_state[FURNITURE])
         for index, color in enumerate(COLORS):
-            pose = scene_state[6 + 6 * index : 12 + 6 * index]
+            pose = scene_state[block_pose(index)]
             self._blocks[color].place(pose[:3], pose[3:])
         self._robot.reset(robot_state)
         p.stepSimulation(physicsClientId=self._client)
@@ -339,9 +337,7 @@ class Desk:
             poses = []
             for _ in COLORS:
                 area = areas[rng.integers(len(areas))]
-                poses.append(
-                    [rng.uniform(*area.x), rng.uniform(*area.y), 0.46, 0.0, 0.0, rng.uniform(-np.pi, np.pi)]
-                )
+                poses.append([rng.uniform(*area.x), rng.uniform(*area.y), 0.46, 0.0, 0.0, rng.uniform(-np.pi, np.pi)])
             # the longest block's half diagonal is 0.045 m
             if all(np.hypot(a[0] - b[0], a[1] - b[1]) > 0.09 for a, b in itertools.combinations(poses, 2)):
                 return np.array([0.0] * 6 + [x for pose in poses for x in pose])
@@ -354,7 +350,7 @@ def _check_cameras(cameras: Sequence[str]) -> None:
 
 
 def _distance(camera: str, inverse: np.ndarray) -> np.ndarray:
-    far = np.float32(CAMERAS[camera].far)
+    far = np.float32(INTRINSICS[camera].far)
     return 1 / np.maximum(inverse, 1 / far)
 
 

@@ -13,7 +13,7 @@ LED_ON = (0.0, 1.0, 0.0, 1.0)
 BULB_ON = (1.0, 1.0, 0.0, 1.0)
 JOINT_FORCE = 4.0
 JOINTS = ("slide", "drawer", "button", "switch")
-"""The desk's joints in the order of ``scene_obs``."""
+"""The desk's joints in the order of `scene_obs`."""
 
 
 class Table:
@@ -21,7 +21,7 @@ class Table:
 
     Attributes:
         body: Bullet body id.
-        links: Link name to link index (``base_link`` is -1).
+        links: Link name to link index (`base_link` is -1).
         bulb, led: Whether each light is on.
     """
 
@@ -55,7 +55,7 @@ class Table:
         return [state[0] for state in p.getJointStates(self.body, indices, physicsClientId=self.client)]
 
     def reset(self, state: np.ndarray) -> None:
-        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the head of ``scene_obs``."""
+        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the head of `scene_obs`."""
         for name, value in zip(JOINTS, state[:4], strict=True):
             p.resetJointState(self.body, self._joints[name], value, physicsClientId=self.client)
         self.bulb, self.led = bool(state[4] > 0.5), bool(state[5] > 0.5)
@@ -81,7 +81,7 @@ class Table:
         }
 
     def observe(self) -> np.ndarray:
-        """The first six numbers of ``scene_obs``: (6,) float64."""
+        """The first six numbers of `scene_obs`: (6,) float64."""
         return np.array([*self.joints(), float(self.bulb), float(self.led)])
 
 
@@ -94,7 +94,7 @@ class Block:
         self.body = p.loadURDF(str(assets.blocks[color]), globalScaling=assets.scale, physicsClientId=client)
 
     def place(self, position: Any, euler: Any) -> None:
-        """Puts the block at ``position`` (3,) m with ``euler`` (3,) rad, at rest."""
+        """Puts the block at `position` (3,) m with `euler` (3,) rad, at rest."""
         p.resetBasePositionAndOrientation(
             self.body, position, p.getQuaternionFromEuler(euler), physicsClientId=self.client
         )

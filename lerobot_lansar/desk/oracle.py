@@ -1,8 +1,8 @@
-"""CALVIN's 34 tasks: which of them were fulfilled between two moments.
+"""CALVIN's success oracle: which of the 34 tasks were fulfilled between two moments.
 
-A task is a relation between the state when a command began and the state now. Both are :class:`Snapshot`: plain data,
-so the oracle needs no simulator. Contacts name what is touched: ``("robot", "")``, ``("desk", <link>)``,
-``("plane", "")`` or ``(<block colour>, "")``.
+A task is a relation between the state when a command began and the state now. Both are `Snapshot`: plain data,
+so the oracle needs no simulator. Contacts name what is touched: `("robot", "")`, `("desk", <link>)`,
+`("plane", "")` or `(<block colour>, "")`.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .scenes import COLORS
+from ..calvin import COLORS, TASKS, Task
 
 Touch = tuple[str, str]
 
@@ -42,7 +42,7 @@ class BlockState:
 
     @property
     def resting(self) -> bool:
-        """No velocity component reaches :data:`AT_REST`."""
+        """No velocity component reaches `AT_REST`."""
         return bool(np.all(np.abs([self.linear_velocity, self.angular_velocity]) < AT_REST))
 
 
@@ -65,10 +65,11 @@ class Snapshot:
     touched_by_robot: frozenset[str]
 
 
-Task = Callable[[Snapshot, Snapshot], bool]
+Condition = Callable[[Snapshot, Snapshot], bool]
+"""Whether a task is fulfilled, of the snapshots at its start and now."""
 
 
-def _rotate(color: str, degrees: float) -> Task:
+def _rotate(color: str, degrees: float) -> Condition:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
         s, e = start.blocks[color], end.blocks[color]
         if not e.surfaces or np.linalg.norm(e.position - s.position) > 0.1:
@@ -81,7 +82,7 @@ def _rotate(color: str, degrees: float) -> Task:
     return fulfilled
 
 
-def _push(color: str, distance: float) -> Task:
+def _push(color: str, distance: float) -> Condition:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
         s, e = start.blocks[color], end.blocks[color]
         moved = (e.position[0] - s.position[0]) * np.sign(distance)
@@ -91,7 +92,7 @@ def _push(color: str, distance: float) -> Task:
     return fulfilled
 
 
-def _lift(color: str, height: float, surface: Touch) -> Task:
+def _lift(color: str, height: float, surface: Touch) -> Condition:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
         s, e = start.blocks[color], end.blocks[color]
         risen = e.position[2] - s.position[2]
@@ -100,7 +101,7 @@ def _lift(color: str, height: float, surface: Touch) -> Task:
     return fulfilled
 
 
-def _place(surface: Touch) -> Task:
+def _place(surface: Touch) -> Condition:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
         if len(start.touched_by_robot) != 1:
             return False
@@ -116,78 +117,75 @@ def _place(surface: Touch) -> Task:
 def _push_into_drawer(start: Snapshot, end: Snapshot) -> bool:
     # The hand may still touch the block at the end: the original's recorded verdicts say so.
     return any(
-        start.blocks[color].contacts == {TABLE} and DRAWER in end.blocks[color].contacts
-        for color in start.blocks
+        start.blocks[color].contacts == {TABLE} and DRAWER in end.blocks[color].contacts for color in start.blocks
     )
 
 
-def _on_blocks_only(block: BlockState) -> bool:
+def is_stacked(block: BlockState) -> bool:
+    """Whether a block rests on other blocks and touches nothing else."""
     return bool(block.bodies) and block.bodies <= set(COLORS) and block.resting
 
 
+def _touches_block(block: BlockState) -> bool:
+    return bool(block.bodies & set(COLORS))
+
+
 def _stack(start: Snapshot, end: Snapshot) -> bool:
-    return any(
-        not (start.blocks[color].bodies & set(COLORS)) and _on_blocks_only(end.blocks[color])
-        for color in start.blocks
-    )
+    return any(not _touches_block(start.blocks[c]) and is_stacked(end.blocks[c]) for c in COLORS)
 
 
 def _unstack(start: Snapshot, end: Snapshot) -> bool:
-    return any(
-        _on_blocks_only(start.blocks[color]) and not (end.blocks[color].bodies & set(COLORS))
-        for color in start.blocks
-    )
+    return any(is_stacked(start.blocks[c]) and not _touches_block(end.blocks[c]) for c in COLORS)
 
 
-def _joint(name: str, change: float) -> Task:
+def _joint(name: str, change: float) -> Condition:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
         return bool((getattr(end, name) - getattr(start, name)) * np.sign(change) > abs(change))
 
     return fulfilled
 
 
-def _light(name: str, on: bool) -> Task:
+def _light(name: str, on: bool) -> Condition:
     def fulfilled(start: Snapshot, end: Snapshot) -> bool:
         return getattr(start, name) != on and getattr(end, name) == on
 
     return fulfilled
 
 
-def _tasks() -> dict[str, Task]:
-    tasks: dict[str, Task] = {}
-    for color in COLORS:
-        tasks[f"rotate_{color}_block_right"] = _rotate(color, -60)
-        tasks[f"rotate_{color}_block_left"] = _rotate(color, 60)
-    for color in COLORS:
-        tasks[f"push_{color}_block_right"] = _push(color, 0.1)
-        tasks[f"push_{color}_block_left"] = _push(color, -0.1)
-    tasks["move_slider_left"] = _joint("slide", 0.15)
-    tasks["move_slider_right"] = _joint("slide", -0.15)
-    tasks["open_drawer"] = _joint("drawer", 0.12)
-    tasks["close_drawer"] = _joint("drawer", -0.12)
-    for color in COLORS:
-        for surface, touch, height in (
-            ("table", TABLE, 0.05),
-            ("slider", PLANK, 0.03),
-            ("drawer", DRAWER, 0.05),
-        ):
-            tasks[f"lift_{color}_block_{surface}"] = _lift(color, height, touch)
-    tasks["place_in_slider"] = _place(PLANK)
-    tasks["place_in_drawer"] = _place(DRAWER)
-    tasks["stack_block"] = _stack
-    tasks["unstack_block"] = _unstack
-    tasks["turn_on_lightbulb"] = _light("bulb", True)
-    tasks["turn_off_lightbulb"] = _light("bulb", False)
-    tasks["turn_on_led"] = _light("led", True)
-    tasks["turn_off_led"] = _light("led", False)
-    tasks["push_into_drawer"] = _push_into_drawer
-    return tasks
+SURFACES: dict[str | None, Touch] = {"table": TABLE, "slider": PLANK, "drawer": DRAWER}
+"""A task's place to the part of the desk that blocks lie on there."""
 
 
-TASKS: dict[str, Task] = _tasks()
-"""The 34 tasks by CALVIN's names, each a function of the start and the end snapshot."""
+def _condition(task: Task) -> Condition:
+    """CALVIN's condition of a task, with its thresholds in metres and degrees."""
+    color, sign = str(task.color), 1 if task.side == "right" else -1
+    conditions: dict[str, Callable[[], Condition]] = {
+        "rotate_block": lambda: _rotate(color, -60 * sign),
+        "push_block": lambda: _push(color, 0.1 * sign),
+        "move_slider": lambda: _joint("slide", -0.15 * sign),
+        "open_drawer": lambda: _joint("drawer", 0.12),
+        "close_drawer": lambda: _joint("drawer", -0.12),
+        "lift_block": lambda: _lift(color, 0.03 if task.place == "slider" else 0.05, SURFACES[task.place]),
+        "place_block": lambda: _place(SURFACES[task.place]),
+        "stack_block": lambda: _stack,
+        "unstack_block": lambda: _unstack,
+        "turn_on_lightbulb": lambda: _light("bulb", True),
+        "turn_off_lightbulb": lambda: _light("bulb", False),
+        "turn_on_led": lambda: _light("led", True),
+        "turn_off_led": lambda: _light("led", False),
+        "push_into_drawer": lambda: _push_into_drawer,
+    }
+    return conditions[task.kind]()
+
+
+_CONDITIONS = {task.name: _condition(task) for task in TASKS.values()}
+
+
+def is_fulfilled(task: str, start: Snapshot, end: Snapshot) -> bool:
+    """Whether the task of that name is fulfilled between `start` and `end`."""
+    return _CONDITIONS[task](start, end)
 
 
 def completed_tasks(start: Snapshot, end: Snapshot) -> set[str]:
-    """Names of the tasks that are fulfilled between ``start`` and ``end``."""
-    return {name for name, fulfilled in TASKS.items() if fulfilled(start, end)}
+    """Names of the tasks that are fulfilled between `start` and `end`."""
+    return {task for task in TASKS if is_fulfilled(task, start, end)}

@@ -1,10 +1,11 @@
-"""The Panda arm: loading, CALVIN's inverse kinematics and position control, and the 15 numbers of ``robot_obs``."""
+"""The Panda arm: loading, CALVIN's inverse kinematics and position control, and the 15 numbers of `robot_obs`."""
 
 from typing import Any
 
 import numpy as np
 import pybullet as p
 
+from ..calvin import ANGLE_UNIT, ARM_JOINTS, GRIPPER_ACTION, GRIPPER_WIDTH, POSITION_UNIT
 from .assets import Assets
 
 BASE_POSITION = (-0.34, -0.46, 0.24)
@@ -16,10 +17,6 @@ TCP_LINK = 15
 CAMERA_LINK = 14
 ARM_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 ARM_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-POSITION_STEP = 0.02
-"""Metres that one unit of a relative action moves the target."""
-ANGLE_STEP = 0.05
-"""Radians that one unit of a relative action turns the target."""
 
 _IK = {
     "lowerLimits": [-7.0] * 9,
@@ -68,13 +65,13 @@ class Robot:
         self._target_euler: np.ndarray = np.zeros(3)
 
     def reset(self, robot_obs: np.ndarray | None) -> None:
-        """Sets the arm's joints and half the opening width for each finger; the TCP part of ``robot_obs`` is ignored.
+        """Sets the arm's joints and half the opening width for each finger; the TCP part of `robot_obs` is ignored.
 
         The relative mode's target becomes the TCP pose reached here.
         """
-        joints = HOME_JOINTS if robot_obs is None else robot_obs[7:14]
-        finger = FINGER_OPEN if robot_obs is None else robot_obs[6] / 2
-        self.gripper_action = 1.0 if robot_obs is None or robot_obs[14] > 0 else -1.0
+        joints = HOME_JOINTS if robot_obs is None else robot_obs[ARM_JOINTS]
+        finger = FINGER_OPEN if robot_obs is None else robot_obs[GRIPPER_WIDTH] / 2
+        self.gripper_action = 1.0 if robot_obs is None or robot_obs[GRIPPER_ACTION] > 0 else -1.0
         for joint, value in zip(ARM, joints, strict=True):
             p.resetJointState(self.body, joint, value, physicsClientId=self.client)
             self._drive(joint, value, force=200, max_velocity=2)
@@ -91,8 +88,8 @@ class Robot:
         In relative mode the action moves a target that is kept from step to step and never re-anchored to the arm.
         """
         if relative:
-            self._target_position += action[:3] * POSITION_STEP
-            self._target_euler += action[3:6] * ANGLE_STEP
+            self._target_position += action[:3] * POSITION_UNIT
+            self._target_euler += action[3:6] * ANGLE_UNIT
             pose = self._target_position, self._target_euler
         else:
             pose = action[:3], action[3:6]
@@ -131,11 +128,11 @@ class Robot:
         return p.getLinkState(self.body, TCP_LINK, physicsClientId=self.client)[:2]
 
     def camera_pose(self) -> tuple[Any, Any]:
-        """Pose of the gripper camera's link, as old as :meth:`tcp_pose`."""
+        """Pose of the gripper camera's link, as old as `tcp_pose`."""
         return p.getLinkState(self.body, CAMERA_LINK, physicsClientId=self.client)[:2]
 
     def observe(self) -> np.ndarray:
-        """``robot_obs``: TCP xyz, TCP euler, opening width, seven arm joints, last gripper action; (15,) float64."""
+        """`robot_obs`: TCP xyz, TCP euler, opening width, seven arm joints, last gripper action; (15,) float64."""
         position, orientation = self.tcp_pose()
         states = p.getJointStates(self.body, ARM + FINGERS, physicsClientId=self.client)
         *arm, left, right = (state[0] for state in states)

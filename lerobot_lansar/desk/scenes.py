@@ -6,10 +6,8 @@ of furniture with its parts in different places, so a scene is a handful of numb
 
 from dataclasses import dataclass, replace
 
+from ..calvin import BLOCK_ORDER
 from .errors import DeskError
-
-COLORS = ("red", "blue", "pink")
-"""The order in which this package writes blocks into ``scene_obs``, whatever the scene."""
 
 BLOCK_LENGTHS = {"small": 0.04, "middle": 0.056, "big": 0.08}
 """A block's extent along its own x axis (m); its other two sides are 0.04 m."""
@@ -38,7 +36,7 @@ class Scene:
         cabinet: World x range of the open cabinet, whose floor is the plank.
         slide_travel: Upper limit of the sliding door (m).
         wood, dark_wood, metal: Colours (rgb in [0, 1]) of the built-in desk.
-        layout: Where each block starts: xyz (m), euler (rad); None: at random in ``areas``.
+        layout: Where each block starts: xyz (m), euler (rad); None: at random in `areas`.
     """
 
     name: str
@@ -58,6 +56,9 @@ class Scene:
     layout: dict[str, tuple[float, ...]] | None = None
 
 
+BUTTON_Y = -0.12
+"""World y of the button (m) in every scene."""
+
 DRAWER_TRAVEL = 0.22
 SWITCH_TRAVEL = 0.088
 BUTTON_TRAVEL = 0.02
@@ -66,9 +67,11 @@ _BEHIND = (0.05, 0.12)
 _FRONT = (-0.15, -0.03)
 
 
-def _areas(
-    table: tuple[float, float], left: tuple[float, float], right: tuple[float, float]
-) -> dict[str, Area]:
+def _blocks(name: str, **variants: str) -> dict[str, str]:
+    return {color: variants[color] for color in BLOCK_ORDER[name]}
+
+
+def _areas(table: tuple[float, float], left: tuple[float, float], right: tuple[float, float]) -> dict[str, Area]:
     return {
         "table": Area(table, _FRONT),
         "slider_left": Area(left, _BEHIND),
@@ -79,7 +82,7 @@ def _areas(
 SCENES = {
     "A": Scene(
         name="A",
-        blocks={"pink": "small", "blue": "big", "red": "middle"},
+        blocks=_blocks("A", red="middle", blue="big", pink="small"),
         areas=_areas((-0.20, 0.35), (-0.32, -0.16), (-0.05, 0.13)),
         button_x=-0.28,
         switch_x=0.30,
@@ -95,7 +98,7 @@ SCENES = {
     ),
     "B": Scene(
         name="B",
-        blocks={"red": "small", "blue": "big", "pink": "middle"},
+        blocks=_blocks("B", red="small", blue="big", pink="middle"),
         areas=_areas((-0.35, 0.15), (-0.12, 0.06), (0.15, 0.33)),
         button_x=0.28,
         switch_x=-0.32,
@@ -111,7 +114,7 @@ SCENES = {
     ),
     "C": Scene(
         name="C",
-        blocks={"blue": "small", "red": "big", "pink": "middle"},
+        blocks=_blocks("C", red="big", blue="small", pink="middle"),
         areas=_areas((0.00, 0.35), (-0.12, 0.06), (0.15, 0.30)),
         button_x=-0.12,
         switch_x=-0.32,
@@ -127,7 +130,7 @@ SCENES = {
     ),
     "D": Scene(
         name="D",
-        blocks={"red": "middle", "blue": "small", "pink": "big"},
+        blocks=_blocks("D", red="middle", blue="small", pink="big"),
         areas=_areas((0.00, 0.35), (-0.32, -0.16), (-0.05, 0.13)),
         button_x=-0.12,
         switch_x=0.30,
@@ -153,7 +156,7 @@ EVALUATION_LAYOUT: dict[str, tuple[float, ...]] = {
 
 
 def get_scene(name: str) -> Scene:
-    """The scene called ``name``: A, B, C, D, or ``D_eval`` for D with the blocks in :data:`EVALUATION_LAYOUT`.
+    """The scene called `name`: A, B, C, D, or `D_eval` for D with the blocks in `EVALUATION_LAYOUT`.
 
     Raises:
         DeskError: There is no such scene.

@@ -4,10 +4,11 @@ import itertools
 
 import numpy as np
 
+from ..calvin import BULB, COLORS, DRAWER, LED, SLIDE, SWITCH, TASKS, Task, block_pose
 from .desk import Desk
 from .errors import DeskError
-from .oracle import DRAWER, PLANK, TABLE, TASKS
-from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, COLORS, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
+from .oracle import SURFACES, TABLE, is_stacked
+from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, BUTTON_Y, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
 
 TABLE_Z = 0.46
 """Height of a block's centre on the table and on the cabinet's floor (m)."""
@@ -15,7 +16,7 @@ DRAWER_Z = 0.362
 """Height of a block's centre in the drawer (m)."""
 
 DOOR_WIDTH = 0.28
-"""The cabinet's sliding door (m); its left edge is at the scene's ``slide_x`` minus the joint."""
+"""The cabinet's sliding door (m); its left edge is at the scene's `slide_x` minus the joint."""
 REACH = 0.41
 """|x| up to which blocks can be pushed and still lie on the table, which ends at 0.44 (m)."""
 
@@ -25,19 +26,19 @@ _REACHED = 0.02  # a start pose counts when IK brings the TCP this near (m)
 
 
 def sample_start(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A random state of ``desk`` in which ``task`` is feasible, and not yet fulfilled.
+    """A random state of `desk` in which `task` is feasible, and not yet fulfilled.
 
     Joints and lights that the task does not care about are random, blocks lie in the scene's areas with yaw in
-    pi/2 +- pi/8 (both as in CALVIN's benchmark), the TCP is anywhere in a box above the table. For ``place_*`` and
-    ``stack_block`` a block is in the hand, for ``unstack_block`` one stands on another.
+    pi/2 +- pi/8 (both as in CALVIN's benchmark), the TCP is anywhere in a box above the table. For `place_*` and
+    `stack_block` a block is in the hand, for `unstack_block` one stands on another.
 
     Args:
         desk: Used to solve inverse kinematics and to settle the blocks; left in the returned state.
-        task: One of :data:`TASKS`.
+        task: One of `TASKS`.
         rng: Decides everything.
 
     Returns:
-        ``robot_obs`` (15,) and ``scene_obs`` (24,), arguments for :meth:`Desk.reset`.
+        `robot_obs` (15,) and `scene_obs` (24,), arguments for `Desk.reset`.
 
     Raises:
         DeskError: Unknown task, or no feasible state found.
@@ -47,7 +48,7 @@ def sample_start(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.nd
     cameras, desk.cameras = desk.cameras, ()
     try:
         for _ in range(_TRIES):
-            start = _try(desk, task, rng)
+            start = _try(desk, TASKS[task], rng)
             if start is not None:
                 return start
     finally:
@@ -55,7 +56,7 @@ def sample_start(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.nd
     raise DeskError(f"found no start state for task {task!r} in scene {desk.scene.name} in {_TRIES} tries")
 
 
-def _try(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+def _try(desk: Desk, task: Task, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
     state = _furniture(desk.scene, task, rng)
     held = _held_color(task, rng)
     poses = _blocks(desk.scene, task, held, state, rng)
@@ -78,89 +79,77 @@ def _try(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.ndarray, n
     return robot_obs, scene_obs
 
 
-def _is_feasible(desk: Desk, task: str, held: str | None, wanted: np.ndarray, got: np.ndarray) -> bool:
+def _is_feasible(desk: Desk, task: Task, held: str | None, wanted: np.ndarray, got: np.ndarray) -> bool:
     """Whether the state after settling still is what was asked for."""
     snapshot = desk.snapshot()
     if snapshot.touched_by_robot != (frozenset() if held is None else {held}):
         return False
     if held is not None and snapshot.blocks[held].bodies != {"robot"}:
         return False
-    blocks = slice(6, None)
-    positions = [np.r_[0:3] + 6 * i for i in range(3)]
-    if any(np.linalg.norm(got[blocks][i] - wanted[blocks][i]) > 0.02 for i in positions):
+    if any(np.linalg.norm((got[block_pose(i)] - wanted[block_pose(i)])[:3]) > 0.02 for i in range(len(COLORS))):
         return False
-    color = _color(task)
-    if task.startswith("push_") and color is not None:
-        end = got[6 + 6 * COLORS.index(color)] + (0.11 if task.endswith("right") else -0.11)
-        if abs(end) > REACH:
+    if task.color is not None:
+        x = got[block_pose(COLORS.index(task.color))][0]
+        if task.kind == "push_block" and abs(x + (0.11 if task.side == "right" else -0.11)) > REACH:
             return False
-    if color is not None:
-        if task.endswith("_slider") and not beside_door(desk.scene, got[0], got[6 + 6 * COLORS.index(color)]):
+        if task.place == "slider" and not beside_door(desk.scene, got[SLIDE], x):
             return False
-        surface = {"slider": PLANK, "drawer": DRAWER}.get(task.rsplit("_", 1)[-1], TABLE)
-        return snapshot.blocks[color].contacts == {surface}
-    if task == "unstack_block":
-        return any(b.bodies and b.bodies <= set(COLORS) and b.resting for b in snapshot.blocks.values())
-    return bool(np.allclose(got[[0, 1, 3, 4, 5]], wanted[[0, 1, 3, 4, 5]], atol=5e-3))
+        return snapshot.blocks[task.color].contacts == {SURFACES.get(task.place, TABLE)}
+    if task.kind == "unstack_block":
+        return any(is_stacked(block) for block in snapshot.blocks.values())
+    settled = [SLIDE, DRAWER, SWITCH, BULB, LED]  # a button may still be on its way
+    return bool(np.allclose(got[settled], wanted[settled], atol=5e-3))
 
 
 def beside_door(scene: Scene, slide: float, x: float) -> bool:
-    """Whether a finger fits between a block at ``x`` in the cabinet and the door's edge: 0.045 m from its middle."""
+    """Whether a finger fits between a block at `x` in the cabinet and the door's edge: 0.045 m from its middle."""
     door = scene.slide_x - slide
     return bool(x < door - 0.045 or x > door + DOOR_WIDTH + 0.045)
 
 
-def _color(task: str) -> str | None:
-    """The block that a task names, if it names one."""
-    words = task.split("_")
-    return words[1] if len(words) > 2 and words[1] in COLORS else None
-
-
-def _held_color(task: str, rng: np.random.Generator) -> str | None:
-    if task in ("place_in_slider", "place_in_drawer", "stack_block"):
+def _held_color(task: Task, rng: np.random.Generator) -> str | None:
+    if task.kind in ("place_block", "stack_block"):
         return COLORS[rng.integers(3)]
     return None
 
 
-def _furniture(scene: Scene, task: str, rng: np.random.Generator) -> np.ndarray:
+def _furniture(scene: Scene, task: Task, rng: np.random.Generator) -> np.ndarray:
     """Slide, drawer, button, switch, bulb, LED: (6,); joints are at an end three times out of four."""
     bulb, led = (bool(rng.integers(2)) for _ in range(2))
-    bulb = {"turn_on_lightbulb": False, "turn_off_lightbulb": True}.get(task, bulb)
-    led = {"turn_on_led": False, "turn_off_led": True}.get(task, led)
-    slide = _joint(rng, scene.slide_travel, 0.17, {"move_slider_left": 0, "move_slider_right": 1}.get(task))
-    needed = {"open_drawer": 0, "close_drawer": 1}.get(task)
+    bulb = {"turn_on_lightbulb": False, "turn_off_lightbulb": True}.get(task.name, bulb)
+    led = {"turn_on_led": False, "turn_off_led": True}.get(task.name, led)
+    slide = _joint(rng, scene.slide_travel, 0.17, {"move_slider_left": 0, "move_slider_right": 1}.get(task.name))
+    needed = {"open_drawer": 0, "close_drawer": 1}.get(task.name)
     drawer = _joint(rng, DRAWER_TRAVEL, 0.14, needed)
-    if (task.endswith("_drawer") and needed is None) or task == "push_into_drawer":
+    if task.place == "drawer" or task.kind == "push_into_drawer":
         drawer = DRAWER_TRAVEL
-    if (task.startswith("lift_") and task.endswith("_slider")) or task == "place_in_slider":
+    if task.place == "slider":
         slide = scene.slide_travel * rng.integers(2)
     return np.array([slide, drawer, 0.0, SWITCH_TRAVEL * bulb, float(bulb), float(led)])
 
 
 def _joint(rng: np.random.Generator, travel: float, needed: float, end: int | None) -> float:
-    """A joint value; ``end`` 0 or 1 leaves at least ``needed`` (m) to the other end."""
+    """A joint value; `end` 0 or 1 leaves at least `needed` (m) to the other end."""
     end = int(rng.integers(2)) if end is None else end
     slack = (travel - needed) * rng.uniform() if rng.uniform() < 0.25 else 0.0
     return slack if end == 0 else travel - slack
 
 
 def _blocks(
-    scene: Scene, task: str, held: str | None, state: np.ndarray, rng: np.random.Generator
+    scene: Scene, task: Task, held: str | None, state: np.ndarray, rng: np.random.Generator
 ) -> dict[str, np.ndarray] | None:
     """Block poses (6,) by colour, or None when they came too near to each other."""
-    color = _color(task)
     open_side = "slider_right" if state[0] > scene.slide_travel / 2 else "slider_left"
     places = {c: str(rng.choice(list(scene.areas))) for c in COLORS}
-    if color is not None:
-        last = task.rsplit("_", 1)[-1]
-        places[color] = {"slider": open_side, "drawer": "drawer"}.get(last, "table")
-    if task == "push_into_drawer":
+    if task.color is not None:
+        places[task.color] = {"slider": open_side, "drawer": "drawer"}.get(str(task.place), "table")
+    if task.kind == "push_into_drawer":
         pushed = COLORS[rng.integers(3)]
         places = {c: "drawer_edge" if c == pushed else str(rng.choice(list(scene.areas)[1:])) for c in COLORS}
-    if task == "stack_block":
+    if task.kind == "stack_block":
         places[next(c for c in COLORS if c != held)] = "table"
     poses = {c: _on(scene, places[c], rng) for c in COLORS if c != held}
-    if task == "unstack_block":
+    if task.kind == "unstack_block":
         top, bottom = rng.permutation(COLORS)[:2]
         poses[bottom] = _on(scene, "table", rng)
         poses[top] = poses[bottom] + [0, 0, BLOCK_SIDE, 0, 0, 0]
@@ -171,8 +160,7 @@ def _blocks(
         return None
     longest = max(BLOCK_LENGTHS.values()) / 2
     if any(
-        abs(pose[0] - scene.button_x) < longest + 0.04 and abs(pose[1] + 0.12) < longest + 0.04
-        for pose in others
+        abs(pose[0] - scene.button_x) < longest + 0.04 and abs(pose[1] - BUTTON_Y) < longest + 0.04 for pose in others
     ):
         return None  # half on the button's rim
     return poses
@@ -191,7 +179,7 @@ def _on(scene: Scene, place: str, rng: np.random.Generator) -> np.ndarray:
 
 
 def _arm(desk: Desk, holding: bool, rng: np.random.Generator) -> np.ndarray | None:
-    """``robot_obs`` (15,) of a random pose above the table, gripper down, or None when the arm cannot reach it."""
+    """`robot_obs` (15,) of a random pose above the table, gripper down, or None when the arm cannot reach it."""
     position = np.array([rng.uniform(-0.32, 0.38), rng.uniform(-0.36, -0.06), rng.uniform(0.51, 0.70)])
     euler = np.array([np.pi + rng.normal(0, 0.1), rng.normal(0, 0.1), np.pi / 2 + rng.uniform(-0.7, 0.7)])
     if holding:

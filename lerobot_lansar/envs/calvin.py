@@ -11,72 +11,67 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from ..desk import CONTROL_HZ, TASKS, Desk, DeskError, Observation, SimulationError
-from ..desk.cameras import CAMERAS
-from ..desk.commands import load_commands
+from ..benchmark import LH_MTLC, load_chains
+from ..calvin import CAMERAS, CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS
+from ..desk import Desk, DeskError, Observation, SimulationError, is_fulfilled
 from ..desk.oracle import Snapshot
 from ..desk.render import RENDERERS
+from ..desk.sentences import load_commands
 from ..desk.starts import sample_start
-from .benchmark import CHAIN_LENGTH, load_chains
-
-LH_MTLC = "lh_mtlc"
-"""The name under which the long-horizon benchmark is asked for."""
-
-CONTROL_MODES = ("rel", "abs")
 
 
 class CalvinEnv(gym.Env):
     """A Panda at a desk with a drawer, a sliding door, a light bulb, an LED and three blocks, told what to do.
 
     Description:
-        ``task="lh_mtlc"`` (default): an episode is one chain of CALVIN's benchmark, five commands in a row.
-        ``task=<name>``: an episode is one command, from a random state in which it is feasible.
-        The command in force is ``env.task_description``; it changes when a command is fulfilled.
+        `task="lh_mtlc"` (default): an episode is one chain of CALVIN's benchmark, five commands in a row.
+        `task=<name>`: an episode is one command, from a random state in which it is feasible.
+        The command in force is `env.task_description`; it changes when a command is fulfilled.
 
     Action space (7,) at 30 Hz:
-        ``control_mode="rel"``: TCP translation in units of 0.02 m and rotation (euler xyz) in units of 0.05 rad, both
-        nominally within +-1 and added to a target pose, then the gripper. ``"abs"``: TCP xyz (m), euler xyz (rad),
+        `control_mode="rel"`: TCP translation in units of 0.02 m and rotation (euler xyz) in units of 0.05 rad, both
+        nominally within +-1 and added to a target pose, then the gripper. `"abs"`: TCP xyz (m), euler xyz (rad),
         gripper. The gripper opens for positive values and closes otherwise.
 
     Observation space:
-        ``agent_pos`` (15,): CALVIN's robot_obs. ``environment_state`` (24,): CALVIN's scene_obs, blocks red, blue,
-        pink; privileged simulator state (58 numbers with ``task_in_state``). ``pixels``: ``static`` (200, 200, 3) and
-        ``gripper`` (84, 84, 3) uint8, those asked for by ``cameras``. ``control_mode`` (1,): 0 relative, 1 absolute;
+        `agent_pos` (15,): CALVIN's robot_obs. `environment_state` (24,): CALVIN's scene_obs, blocks red, blue,
+        pink; privileged simulator state (58 numbers with `task_in_state`). `pixels`: `static` (200, 200, 3) and
+        `gripper` (84, 84, 3) uint8, those asked for by `cameras`. `control_mode` (1,): 0 relative, 1 absolute;
         policies check it.
 
     Rewards: 1 for each fulfilled command, judged by CALVIN's oracle after every step; 0 otherwise. The return of a
         chain is the number of commands fulfilled in a row, its mean over chains CALVIN's average length.
 
-    Success: ``info["is_success"]`` is True when all commands of the episode are fulfilled.
+    Success: `info["is_success"]` is True when all commands of the episode are fulfilled.
 
-    Starting state: chain number ``seed % 1000``, or a random feasible state drawn from ``seed``. Without a seed
+    Starting state: chain number `seed % 1000`, or a random feasible state drawn from `seed`. Without a seed
         the environment's own generator decides.
 
     Episode end: terminated when the last command is fulfilled or a command is not fulfilled within
-        ``steps_per_command`` control steps (360 in CALVIN). An episode whose simulation diverges ends as failed, with
+        `steps_per_command` control steps (360 in CALVIN). An episode whose simulation diverges ends as failed, with
         the last finite observation.
 
     Args:
-        task: ``"lh_mtlc"`` or one of the 34 tasks.
-        scene: ``"A"``, ``"B"``, ``"C"`` or ``"D"``; the benchmark is defined on D.
-        assets: ``data`` folder of a calvin_env checkout, or None for the built-in desk.
+        task: `"lh_mtlc"` or one of the 34 tasks.
+        scene: `"A"`, `"B"`, `"C"` or `"D"`; the benchmark is defined on D.
+        assets: `data` folder of a calvin_env checkout, or None for the built-in desk.
         cameras: Pictures in the observation; without any, an episode takes a half to a third of the time.
-        control_mode: ``"rel"`` or ``"abs"``.
+        control_mode: `"rel"` or `"abs"`.
         steps_per_command: Control steps that a command may take.
         annotations: YAML file of sentences by task (CALVIN's format); our own by default.
-        results_dir: If given, every finished episode is appended to ``episodes-<process id>.jsonl`` in it.
-        renderer: ``"fast"``, ``"fast_gl"`` (the look of CALVIN's public data), ``"tiny"`` or ``"egl"``; see
-            :class:`~lerobot_lansar.desk.Desk`.
+        results_dir: If given, every finished episode is appended to `episodes-<process id>.jsonl` in it.
+        renderer: `"fast"`, `"fast_gl"` (the look of CALVIN's public data), `"tiny"` or `"egl"`; see
+            `Desk`.
         perturbation_every: If not 0, the position difference of every so many-th action is replaced by a draw from
-            the normal distribution around it with ``perturbation_scale`` times its size as standard deviation, each
+            the normal distribution around it with `perturbation_scale` times its size as standard deviation, each
             coordinate on its own (Eq 4.9 of the thesis; its experiments are 50 and 5, 25 and 2.5, 5 and 0.5). The
             draws depend on the episode's seed.
         perturbation_scale: Gamma of that equation.
-        render_fps: How often ``render`` draws a new picture; in between it returns the last one again.
-        task_in_state: ``environment_state`` also holds a number for each of the 34 tasks, 1 for the one that is
+        render_fps: How often `render` draws a new picture; in between it returns the last one again.
+        task_in_state: `environment_state` also holds a number for each of the 34 tasks, 1 for the one that is
             commanded and 0 for the others: for policies that read no language (ACT, Diffusion, VQ-BeT), trained on
-            what ``lansar-convert --task_in_state=true`` makes.
-        render_mode: ``"rgb_array"``, the static camera's picture.
+            what `lansar-convert --task_in_state=true` makes.
+        render_mode: `"rgb_array"`, the static camera's picture.
 
     Version: v0.
     """
@@ -90,7 +85,7 @@ class CalvinEnv(gym.Env):
         assets: str | None = None,
         cameras: Sequence[str] = ("static", "gripper"),
         control_mode: str = "rel",
-        steps_per_command: int = 360,
+        steps_per_command: int = STEPS_PER_COMMAND,
         annotations: str | None = None,
         results_dir: str | None = None,
         renderer: str = "fast",
@@ -103,13 +98,9 @@ class CalvinEnv(gym.Env):
         if task != LH_MTLC and task not in TASKS:
             raise DeskError(f"task {task!r} is unknown; it is {LH_MTLC!r} or one of: {', '.join(TASKS)}")
         if task == LH_MTLC and scene != "D":
-            raise DeskError(
-                f"the benchmark's chains start in scene D, not {scene!r}; name a single task for {scene!r}"
-            )
+            raise DeskError(f"the benchmark's chains start in scene D, not {scene!r}; name a single task for {scene!r}")
         if scene == "D_eval":
-            raise DeskError(
-                "scene 'D_eval' fixes the blocks, but an episode's task or chain decides; use 'D'"
-            )
+            raise DeskError("scene 'D_eval' fixes the blocks, but an episode's task or chain decides; use 'D'")
         if control_mode not in CONTROL_MODES:
             raise DeskError(f"control_mode {control_mode!r} is unknown; it is 'rel' or 'abs'")
         if steps_per_command < 1 or not 1 <= render_fps <= CONTROL_HZ:
@@ -151,7 +142,7 @@ class CalvinEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts an episode; see the class for what ``seed`` decides. ``options`` are ignored."""
+        """Starts an episode; see the class for what `seed` decides. `options` are ignored."""
         super().reset(seed=seed)
         if self._desk is None:
             self._desk = Desk(**self._desk_options)  # type: ignore[arg-type]
@@ -171,9 +162,7 @@ class CalvinEnv(gym.Env):
         self._last = obs
         self._disturbance = np.random.default_rng([self._seed, 4, 9])
         self._done = []
-        self._picture: tuple[int, np.ndarray] | None = (
-            None  # the step it was drawn at, and the static picture
-        )
+        self._picture: tuple[int, np.ndarray] | None = None  # the step it was drawn at, and the static picture
         self._steps = 0
         self._begin_command()
         return self._observation(obs), self._info()
@@ -197,7 +186,7 @@ class CalvinEnv(gym.Env):
             self._diverged = True
         self._steps += 1
         self._command_steps += 1
-        fulfilled = not self._diverged and TASKS[self._current](self._start, self._desk.snapshot())
+        fulfilled = not self._diverged and is_fulfilled(self._current, self._start, self._desk.snapshot())
         failed = self._diverged or (not fulfilled and self._command_steps >= self.steps_per_command)
         if fulfilled or failed:
             self._done.append(
@@ -316,7 +305,7 @@ class CalvinEnv(gym.Env):
 
 
 def environment_state_size(task_in_state: bool) -> int:
-    """How many numbers ``environment_state`` has."""
+    """How many numbers `environment_state` has."""
     return 24 + (len(TASKS) if task_in_state else 0)
 
 
@@ -330,9 +319,7 @@ def _observation_space(cameras: tuple[str, ...], scene_size: int) -> spaces.Dict
         if camera not in CAMERAS:
             raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
     if cameras:
-        entries["pixels"] = spaces.Dict(
-            {c: spaces.Box(0, 255, (CAMERAS[c].size, CAMERAS[c].size, 3), np.uint8) for c in cameras}
-        )
+        entries["pixels"] = spaces.Dict({c: spaces.Box(0, 255, (CAMERAS[c], CAMERAS[c], 3), np.uint8) for c in cameras})
     return spaces.Dict(entries)
 
 

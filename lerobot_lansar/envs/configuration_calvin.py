@@ -1,4 +1,4 @@
-"""``--env.type=calvin``: the options of the CALVIN desk in LeRobot's commands, and its vector environments."""
+"""`--env.type=calvin`: the options of the CALVIN desk in LeRobot's commands, and its vector environments."""
 
 import functools
 from dataclasses import dataclass, field
@@ -9,35 +9,36 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from ..benchmark import LH_MTLC
+from ..calvin import CAMERAS, CONTROL_HZ, STEPS_PER_COMMAND
 from ..desk import Desk
-from ..desk.cameras import CAMERAS
 from ..desk.errors import DeskError
-from .calvin import LH_MTLC, CalvinEnv, environment_state_size
+from .calvin import CalvinEnv, environment_state_size
 
 
 @EnvConfig.register_subclass("calvin")
 @dataclass
 class CalvinEnvConfig(EnvConfig):
-    """The CALVIN desk; see :class:`~lerobot_lansar.envs.calvin.CalvinEnv` for what each option does.
+    """The CALVIN desk; see `CalvinEnv` for what each option does.
 
     Attributes:
-        task: ``lh_mtlc`` for the benchmark's chains, a task's name, or several names separated by commas: LeRobot
-            then evaluates one after the other, ``--eval.n_episodes`` each.
+        task: `lh_mtlc` for the benchmark's chains, a task's name, or several names separated by commas: LeRobot
+            then evaluates one after the other, `--eval.n_episodes` each.
     """
 
     task: str | None = LH_MTLC
-    fps: int = 30
+    fps: int = CONTROL_HZ
     scene: str = "D"
     assets: str | None = None
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
     control_mode: str = "rel"
-    steps_per_command: int = 360
+    steps_per_command: int = STEPS_PER_COMMAND
     annotations: str | None = None
     results_dir: str | None = None
     renderer: str = "fast"
     perturbation_every: int = 0
     perturbation_scale: float = 0.0
-    render_fps: int = 30
+    render_fps: int = CONTROL_HZ
     task_in_state: bool = False
 
     def __post_init__(self) -> None:
@@ -49,15 +50,13 @@ class CalvinEnvConfig(EnvConfig):
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (7,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (15,)),
-            "environment_state": PolicyFeature(
-                FeatureType.ENV, (environment_state_size(self.task_in_state),)
-            ),
+            "environment_state": PolicyFeature(FeatureType.ENV, (environment_state_size(self.task_in_state),)),
         }
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
         for camera in self.cameras:
             if camera not in CAMERAS:
                 raise DeskError(f"--env.cameras: {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
-            size, key = CAMERAS[camera].size, f"{OBS_IMAGES}.{camera}"
+            size, key = CAMERAS[camera], f"{OBS_IMAGES}.{camera}"
             self.features[key] = PolicyFeature(FeatureType.VISUAL, (size, size, 3))
             self.features_map[key] = key
 
@@ -68,7 +67,7 @@ class CalvinEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict:
-        """Arguments of :class:`CalvinEnv`, without the task."""
+        """Arguments of `CalvinEnv`, without the task."""
         names = (
             "scene",
             "assets",
@@ -84,26 +83,20 @@ class CalvinEnvConfig(EnvConfig):
         )
         return {name: getattr(self, name) for name in names} | {"render_fps": self.render_fps}
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector environment per task: ``{task: {0: environment}}``.
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """One vector environment per task: `{task: {0: environment}}`.
 
         Finished episodes freeze instead of being simulated on. Workers are forked: a fresh interpreter would import
-        all of LeRobot (20 s and 0.9 GB each). The first task's are forked here, in ``lerobot-eval`` before the
+        all of LeRobot (20 s and 0.9 GB each). The first task's are forked here, in `lerobot-eval` before the
         policy exists, the others' when their turn comes.
         """
         tasks = [task.strip() for task in (self.task or LH_MTLC).split(",")]
-        makers = {
-            task: [functools.partial(CalvinEnv, task=task, **self.gym_kwargs)] * n_envs for task in tasks
-        }
+        makers = {task: [functools.partial(CalvinEnv, task=task, **self.gym_kwargs)] * n_envs for task in tasks}
         if not use_async_envs or n_envs == 1:
             mode = gym.vector.AutoresetMode.NEXT_STEP
             return {
                 task: {
-                    0: gym.vector.SyncVectorEnv(
-                        [freeze_after_episode_end(make) for make in made], autoreset_mode=mode
-                    )
+                    0: gym.vector.SyncVectorEnv([freeze_after_episode_end(make) for make in made], autoreset_mode=mode)
                 }
                 for task, made in makers.items()
             }

@@ -7,7 +7,7 @@ from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim import AdamWConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from .clip import ClipConfig, embedding_size
+from ..clip.model import ClipConfig, embedding_size
 from .network import NetworkConfig
 from .scaling import STATE_DIM, encoded_sizes
 from .scheduler import LinearWarmupDecaySchedulerConfig
@@ -38,41 +38,41 @@ class LanSARConfig(PreTrainedConfig):
     Attributes:
         hidden, context_layers, context_heads, decoder_layers, decoder_heads, feedforward, dropout: Table 4.2;
             8 decoder heads, since the table's 6 do not divide 512.
-        window: longest history in steps, in training and at inference.
-        mlp_norm: normalisation in the MLPs. "batch" as in the thesis; "layer" for small batches.
-        use_images: static and gripper picture (CLIP embeddings) are part of the context.
-        use_spatial_context: robot, block and scene state are part of the context (the decoder always sees the
+        window: Longest history in steps, in training and at inference.
+        mlp_norm: Normalisation in the MLPs. "batch" as in the thesis; "layer" for small batches.
+        use_images: Static and gripper picture (CLIP embeddings) are part of the context.
+        use_spatial_context: Robot, block and scene state are part of the context (the decoder always sees the
             robot).
-        command_in_context: the command is also a token of the context, and CLS asks with it which of the others matter.
-        command_prepended: the command stands once at the front instead of before every step (Table 5.3).
-        orientation: how euler angles enter the network. "euler" as they are, "sincos" without the +-pi jump
+        command_in_context: The command is also a token of the context, and CLS asks with it which of the others matter.
+        command_prepended: The command stands once at the front instead of before every step (Table 5.3).
+        orientation: How euler angles enter the network. "euler" as they are, "sincos" without the +-pi jump
             (the gripper's roll sits there). Predicted are wrapped differences either way.
-        egocentric_blocks: blocks also come as seen from the TCP, with finer steps near it, so that the network
+        egocentric_blocks: Blocks also come as seen from the TCP, with finer steps near it, so that the network
             need not learn to subtract two positions.
-        target: what the motion head learns: "commanded" = the recorded action minus the current pose;
+        target: What the motion head learns: "commanded" = the recorded action minus the current pose;
             "achieved" = the next pose minus the current pose (thesis).
-        window_start: which windows are trained on, see `windows.py`. "episode" = from the demonstration's
+        window_start: Which windows are trained on, see `windows.py`. "episode" = from the demonstration's
             start (thesis), "anywhere" = from the sampled frame, "mixed" = half of each.
-        paraphrases: in training a window's command is replaced by a random one among the dataset's sentences for
+        paraphrases: In training a window's command is replaced by a random one among the dataset's sentences for
             the same CALVIN task (the dataset's column calvin.task).
-        state_noise: in training the robot state (but not the last gripper action) is disturbed by normal noise of this
+        state_noise: In training the robot state (but not the last gripper action) is disturbed by normal noise of this
             standard deviation, in its own units, m and rad.
-        contrastive_weight: weight of a contrastive loss between commands and the windows that carry them out; those
+        contrastive_weight: Weight of a contrastive loss between commands and the windows that carry them out; those
             of the same CALVIN task are not held against each other (the dataset's column calvin.task).
         dtype: "float32", or "bfloat16" for mixed-precision training on a GPU that has it.
-        smooth_l1_beta: beta of Eq 4.3, 4.4.
+        smooth_l1_beta: Beta of Eq 4.3, 4.4.
         learning_rate, weight_decay, warmup_fraction: AdamW and its schedule (Table 4.2).
-        control_mode: what `select_action` returns. "abs": target pose (m, rad); "rel": the difference to the
+        control_mode: What `select_action` returns. "abs": target pose (m, rad); "rel": the difference to the
             pose in units of (0.02 m, 0.05 rad), clipped to +-1. Must be the env's own (`--env.control_mode`).
-        history_clear_steps: the history is forgotten after this many steps (and whenever the command
+        history_clear_steps: The history is forgotten after this many steps (and whenever the command
             changes).
-        window_slide: once the window is full, its oldest steps are forgotten so many at a time. 1 as in the
+        window_slide: Once the window is full, its oldest steps are forgotten so many at a time. 1 as in the
             thesis: every position changes at every step, so the whole window is decoded again. Half a window
             (what 0, the default, stands for) decodes one step most of the time.
-        position_scale_start, position_scale_slope: predicted position differences are multiplied by
+        position_scale_start, position_scale_slope: Predicted position differences are multiplied by
             start - slope * history / window; the thesis has 3 and 1 (Eq 4.8).
-        yaw_scale: predicted yaw differences are multiplied by this; 1.5 in the thesis (section 4.3.1).
-        clip: which CLIP embeds commands and pictures.
+        yaw_scale: Predicted yaw differences are multiplied by this; 1.5 in the thesis (section 4.3.1).
+        clip: Which CLIP embeds commands and pictures.
     """
 
     hidden: int = 512
@@ -129,14 +129,10 @@ class LanSARConfig(PreTrainedConfig):
         super().__post_init__()
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
-                raise ValueError(
-                    f"--policy.{name}={getattr(self, name)!r} is not one of {', '.join(choices)}."
-                )
+                raise ValueError(f"--policy.{name}={getattr(self, name)!r} is not one of {', '.join(choices)}.")
         for heads in ("context_heads", "decoder_heads"):
             if self.hidden % getattr(self, heads):
-                raise ValueError(
-                    f"--policy.{heads}={getattr(self, heads)} must divide --policy.hidden={self.hidden}."
-                )
+                raise ValueError(f"--policy.{heads}={getattr(self, heads)} must divide --policy.hidden={self.hidden}.")
         for name in ("window", "context_layers", "decoder_layers", "history_clear_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--policy.{name}={getattr(self, name)} must be at least 1.")
@@ -184,7 +180,7 @@ class LanSARConfig(PreTrainedConfig):
         """Check the features LeRobot found in the dataset or env; called when the policy is built.
 
         Raises:
-            ValueError: naming every feature that is missing or of the wrong shape.
+            ValueError: Naming every feature that is missing or of the wrong shape.
         """
         features = {**(self.input_features or {}), **(self.output_features or {})}
         if not features:

@@ -11,13 +11,12 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
+from ..calvin import ANGLE_UNIT, CONTROL_MODES, POSITION_UNIT, wrap_angle
 from .configuration_lansar import LanSARConfig
 from .network import DecoderCache, LanSARNetwork
 from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_GROUP, VALID_STEPS
-from .scaling import SCENE_DIM, STATE_DIM, Scaler, wrap
-from .windows import ORIENTATION_UNIT, POSITION_UNIT, Windows, set_current
-
-CONTROL_MODES = {0: "rel", 1: "abs"}  # the env's observation.control_mode
+from .scaling import SCENE_DIM, STATE_DIM, Scaler
+from .windows import Windows, set_current
 
 
 @dataclass
@@ -25,9 +24,9 @@ class History:
     """What one environment's episode has been since its history was last cleared.
 
     Attributes:
-        command: the sentence being carried out.
+        command: The sentence being carried out.
         projections: C for the memory and for the target, (1, h) each; None before the first step.
-        steps: control steps since then; the window below may be shorter.
+        steps: Control steps since then; the window below may be shorter.
         contexts: E of the last steps, (length, h); each is computed once and kept.
         states: X_target of the last steps, (length, h).
     """
@@ -58,14 +57,14 @@ class LanSARPolicy(PreTrainedPolicy):
     """Language-commanded Scene-aware Action Response.
 
     Args:
-        config: all options.
-        dataset_stats: ignored, LanSAR scales with statistics of its own.
-        dataset_meta: given in training only. The policy then computes its scaling statistics from all the
+        config: All options.
+        dataset_stats: Ignored, LanSAR scales with statistics of its own.
+        dataset_meta: Given in training only. The policy then computes its scaling statistics from all the
             dataset's frames (a checkpoint's own replace them afterwards) and makes the training windows
             available to its preprocessor.
 
     Raises:
-        ValueError, FileNotFoundError: the dataset lacks something; the message says what.
+        ValueError, FileNotFoundError: The dataset lacks something; the message says what.
     """
 
     config_class = LanSARConfig
@@ -122,7 +121,7 @@ class LanSARPolicy(PreTrainedPolicy):
         """Loss of a batch of windows, averaged over their valid steps (Eq 4.3-4.6).
 
         Args:
-            batch: what the preprocessor makes of sampled frames, see `processor_lansar.py`.
+            batch: What the preprocessor makes of sampled frames, see `processor_lansar.py`.
 
         Returns:
             The scalar loss, and its parts.
@@ -135,7 +134,7 @@ class LanSARPolicy(PreTrainedPolicy):
             noise = self.config.state_noise * torch.randn_like(state)
             noise[..., -1] = 0  # the gripper action stays -1 or +1
             state = state + noise
-            state = torch.cat([state[..., :3], wrap(state[..., 3:6]), state[..., 6:]], dim=-1)
+            state = torch.cat([state[..., :3], wrap_angle(state[..., 3:6]), state[..., 6:]], dim=-1)
         state, blocks, scene = self.scaler.encode(state, batch[OBS_ENV_STATE])
         static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
         command, same = batch[CLIP_COMMAND], batch.get(COMMAND_GROUP)
@@ -161,7 +160,7 @@ class LanSARPolicy(PreTrainedPolicy):
         """One action per environment.
 
         Args:
-            batch: a preprocessed env observation: observation.state (B, 15), observation.environment_state
+            batch: A preprocessed env observation: observation.state (B, 15), observation.environment_state
                 (B, 24), observation.clip.* (B, D), task: B sentences, and, if the env says so,
                 observation.control_mode (B, 1).
 
@@ -170,7 +169,7 @@ class LanSARPolicy(PreTrainedPolicy):
             units of (0.02 m, 0.05 rad) clipped to +-1, gripper -1/+1.
 
         Raises:
-            ValueError: wrong shapes, NaN, or an env in the other control mode.
+            ValueError: Wrong shapes, NaN, or an env in the other control mode.
         """
         if self.training:
             self.eval()
@@ -186,11 +185,7 @@ class LanSARPolicy(PreTrainedPolicy):
         sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, SCENE_DIM + 18))
         for name, value, size in sizes:
             if value.ndim != 2 or value.shape[1] != size:
-                told = (
-                    " LanSAR reads the command itself: --env.task_in_state=false."
-                    if name == OBS_ENV_STATE
-                    else ""
-                )
+                told = " LanSAR reads the command itself: --env.task_in_state=false." if name == OBS_ENV_STATE else ""
                 raise ValueError(f"{name} must be (B, {size}), got {tuple(value.shape)}.{told}")
             if not value.isfinite().all():
                 rows = (~value.isfinite().all(dim=1)).nonzero().flatten().tolist()
@@ -200,7 +195,7 @@ class LanSARPolicy(PreTrainedPolicy):
         mode = batch.get("observation.control_mode")
         if mode is not None:
             for value in mode.flatten().tolist():
-                env, mine = CONTROL_MODES.get(int(value), str(value)), self.config.control_mode
+                env, mine = CONTROL_MODES[int(value)], self.config.control_mode
                 if env != mine:
                     raise ValueError(
                         f"The environment takes {env} actions (--env.control_mode={env}), this policy "
@@ -259,8 +254,8 @@ class LanSARPolicy(PreTrainedPolicy):
         orientation = delta[:, 3:] * delta.new_tensor([1.0, 1.0, config.yaw_scale])
         grip = torch.where(logit > 0, 1.0, -1.0)[:, None]
         if config.control_mode == "abs":
-            return torch.cat([state[:, :3] + position, wrap(state[:, 3:6] + orientation), grip], dim=1)
-        relative = torch.cat([position / POSITION_UNIT, orientation / ORIENTATION_UNIT], dim=1)
+            return torch.cat([state[:, :3] + position, wrap_angle(state[:, 3:6] + orientation), grip], dim=1)
+        relative = torch.cat([position / POSITION_UNIT, orientation / ANGLE_UNIT], dim=1)
         return torch.cat([relative.clamp(-1, 1), grip], dim=1)
 
     def _decode(self, commands: tuple[Tensor, Tensor]) -> Tensor:

@@ -39,15 +39,15 @@ class NetworkConfig:
     """Sizes and choices of the network; the defaults are Table 4.2 (6 decoder heads do not divide 512: 8).
 
     Attributes:
-        state_dim: numbers in the encoded robot state X.
-        block_dim: numbers per encoded block B.
-        scene_dim: numbers in the scene state S.
+        state_dim: Numbers in the encoded robot state X.
+        block_dim: Numbers per encoded block B.
+        scene_dim: Numbers in the scene state S.
         clip_dim: D, size of the CLIP embeddings of command and images.
-        mlp_norm: normalisation inside the MLPs, "batch" (thesis) or "layer".
-        use_images: tokens I and G take part in the context.
-        use_spatial_context: tokens X, B (x3) and S take part in the context (the decoder's target keeps X
+        mlp_norm: Normalisation inside the MLPs, "batch" (thesis) or "layer".
+        use_images: Tokens I and G take part in the context.
+        use_spatial_context: Tokens X, B (x3) and S take part in the context (the decoder's target keeps X
             anyway).
-        command_in_context: the command is one more context token (section 6.5.1), and CLS asks with it: what E_t
+        command_in_context: The command is one more context token (section 6.5.1), and CLS asks with it: what E_t
             keeps of a timestep depends on the command already in the first context layer.
         command_prepended: C stands once at the front of memory and target instead of before every step (Table
             5.3).
@@ -183,9 +183,7 @@ def recorded_attention(layers: nn.ModuleList) -> Iterator[dict[str, list[Tensor]
 
 class FeedForward(nn.Sequential):
     def __init__(self, hidden: int, feedforward: int, dropout: float) -> None:
-        super().__init__(
-            nn.Linear(hidden, feedforward), nn.ReLU(), nn.Dropout(dropout), nn.Linear(feedforward, hidden)
-        )
+        super().__init__(nn.Linear(hidden, feedforward), nn.ReLU(), nn.Dropout(dropout), nn.Linear(feedforward, hidden))
 
 
 class EncoderLayer(nn.Module):
@@ -230,13 +228,13 @@ class DecoderCache:
     tokens only. A token's keys and values stay right as long as its position in the window does.
 
     Args:
-        config: the network's.
-        rows: how many environments.
-        like: a parameter; the buffers get its dtype and device.
+        config: The network's.
+        rows: How many environments.
+        like: A parameter; the buffers get its dtype and device.
 
     Attributes:
         tokens: (layers, 2: self and cross, 2: keys and values, rows, heads, tokens of a full window, h / heads).
-        steps: how many steps each row holds; setting one to 0 forgets that row.
+        steps: How many steps each row holds; setting one to 0 forgets that row.
     """
 
     def __init__(self, config: NetworkConfig, rows: int, like: Tensor) -> None:
@@ -250,7 +248,7 @@ class DecoderCache:
         """Makes room for the next `steps` steps of each of `rows`, which are then decoded at once.
 
         Raises:
-            ValueError: the window is full, or `rows` are at their first step and others are not, where the
+            ValueError: The window is full, or `rows` are at their first step and others are not, where the
                 command stands once at the front.
         """
         held = [self.steps[row] for row in rows]
@@ -416,7 +414,7 @@ class LanSARNetwork(nn.Module):
             contexts: E, (B, n, h); steps past a window's end may hold anything finite.
             states: X_target, (B, n, h); likewise.
             command: C for memory and target, (B, h) each, from `encode_command`.
-            past: from `DecoderCache.add`, when the n steps are not the window's first ones: the result is then
+            past: From `DecoderCache.add`, when the n steps are not the window's first ones: the result is then
                 the same as that of the whole window, to rounding, at the cost of n steps.
 
         Returns:
@@ -488,9 +486,7 @@ class LanSARNetwork(nn.Module):
             contrast = self._contrast(group, commands[0], seen, rows, batch, n)
         return motion, logit, contrast
 
-    def _contrast(
-        self, group: Tensor, projected: Tensor, seen: Tensor, rows: Tensor, batch: int, n: int
-    ) -> Tensor:
+    def _contrast(self, group: Tensor, projected: Tensor, seen: Tensor, rows: Tensor, batch: int, n: int) -> Tensor:
         """Pulls a command towards the windows that carry it out, away from the others (section 6.5.1).
 
         A window is described by what is seen in it on average and by how that changes from its first to its

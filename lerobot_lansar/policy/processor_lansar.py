@@ -26,9 +26,9 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from .clip import Clip, ClipConfig, weights_are_public
+from ..clip.model import Clip, ClipConfig, weights_are_public
+from ..clip.store import IMAGE_FEATURES
 from .configuration_lansar import LanSARConfig
-from .frames import CAMERAS
 from .windows import Windows, get_current
 
 CLIP_COMMAND = "observation.clip.command"
@@ -94,9 +94,9 @@ class ClipStep(ProcessorStep):
     step.
 
     Attributes:
-        model, pretrained: see `ClipConfig`.
-        use_images: whether the policy looks at pictures.
-        weights_sha256: of the CLIP the policy was trained with; "" before training.
+        model, pretrained: See `ClipConfig`.
+        use_images: Whether the policy looks at pictures.
+        weights_sha256: Of the CLIP the policy was trained with; "" before training.
     """
 
     model: str
@@ -112,7 +112,7 @@ class ClipStep(ProcessorStep):
         """The CLIP, built at first use; moved to `device` if one is named.
 
         Raises:
-            ValueError: it is not the one the policy or the dataset's embeddings were made with.
+            ValueError: It is not the one the policy or the dataset's embeddings were made with.
         """
         if self._clip is None:
             mine = ClipConfig(self.model, self.pretrained)
@@ -152,7 +152,7 @@ class ClipStep(ProcessorStep):
         if self.use_images:
             for name, key in CLIP_IMAGE.items():
                 if key not in observation:
-                    observation[key] = self._embed(clip, observation, CAMERAS[name])
+                    observation[key] = self._embed(clip, observation, IMAGE_FEATURES[name])
         new = transition.copy()
         new[TransitionKey.OBSERVATION] = observation
         return new
@@ -193,7 +193,7 @@ def make_lansar_pre_post_processors(
     """The pipelines of a new LanSAR; LeRobot's own steps all stay, its commands override them by name.
 
     Args:
-        config: the policy's options.
+        config: The policy's options.
         dataset_stats: LeRobot's statistics, kept by its (inactive) normaliser.
 
     Returns:

@@ -1,8 +1,6 @@
 """What the network reads and predicts, in numbers of order one: orientation encoding and standard scaling (Eq
 4.7)."""
 
-import math
-
 import torch
 from torch import Tensor, nn
 
@@ -16,11 +14,6 @@ DELTA_DIM = 6  # position (m) and orientation (rad) difference
 INPUT_FLOOR = 1e-2
 NEAR = 0.05  # m; within this distance of the TCP a block's relative position is given in finer steps
 DELTA_FLOOR = 1e-3
-
-
-def wrap(angle: Tensor) -> Tensor:
-    """Angles in rad to (-pi, pi]."""
-    return math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
 
 
 def encoded_sizes(orientation: str, egocentric_blocks: bool) -> tuple[int, int, int]:

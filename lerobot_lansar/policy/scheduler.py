@@ -13,7 +13,7 @@ class LinearWarmupDecaySchedulerConfig(LRSchedulerConfig):
     """Linear warm-up to the optimizer's rate, then linear decay to 0 at the last update.
 
     Attributes:
-        num_warmup_steps: updates of warm-up; None takes `warmup_fraction` of the run instead.
+        num_warmup_steps: Updates of warm-up; None takes `warmup_fraction` of the run instead.
         warmup_fraction: 5 of 125 epochs in the thesis. A fraction, so that a shorter run keeps the shape.
     """
 

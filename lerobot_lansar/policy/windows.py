@@ -23,63 +23,53 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .frames import load_embeddings, load_frames, load_sentences, paraphrases
+from ..calvin import ACTION_NAMES, POSE_UNITS, TCP_POSE, wrap_angle
+from ..clip.store import load_embeddings
+from .frames import load_frames, load_sentences, paraphrases
 
 if TYPE_CHECKING:
     from .configuration_lansar import LanSARConfig
-
-POSITION_UNIT = 0.02  # m per 1.0 of a relative action (CALVIN)
-ORIENTATION_UNIT = 0.05  # rad per 1.0 of a relative action (CALVIN)
-ACTION_NAMES = {
-    "rel": ["delta_x", "delta_y", "delta_z", "delta_roll", "delta_pitch", "delta_yaw", "gripper"],
-    "abs": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
-}
 
 
 def action_form(features: dict) -> str:
     """Whether a dataset's `action` is relative ("rel") or absolute ("abs"), told by its names.
 
     Raises:
-        ValueError: the names are neither.
+        ValueError: The names are neither.
     """
     names = features.get("action", {}).get("names")
     for form, expected in ACTION_NAMES.items():
-        if names is not None and list(names) == expected:
+        if names is not None and tuple(names) == expected:
             return form
     raise ValueError(
         f"The dataset's action is named {names}; LanSAR must know whether it is relative "
-        f"{ACTION_NAMES['rel']} or absolute {ACTION_NAMES['abs']}. Datasets made by lansar-convert say so."
+        f"{list(ACTION_NAMES['rel'])} or absolute {list(ACTION_NAMES['abs'])}. Datasets made by lansar-convert say so."
     )
-
-
-def wrap_angles(angle: np.ndarray) -> np.ndarray:
-    """Angles in rad to (-pi, pi]."""
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
 
 
 def motion_targets(frames: dict[str, np.ndarray], form: str, target: str) -> np.ndarray:
     """What the network should predict at every frame (thesis section 4.2, Eq 4.3-4.5).
 
     Args:
-        frames: from `load_frames`.
+        frames: From `load_frames`.
         form: "rel" or "abs", what the recorded action is.
         target: "commanded": where the action wants the TCP minus where it is; a relative action is exactly
             that, in units of (0.02 m, 0.05 rad). "achieved": where the TCP is one frame later minus where it
             is; nothing for an episode's last frame, whose row is meaningless.
 
     Returns:
-        (T, 7) float32: position (m), orientation (rad, wrapped to (-pi, pi]), gripper command 0 close / 1
+        (T, 7) float32: position (m), orientation (rad, wrapped to [-pi, pi)), gripper command 0 close / 1
         open.
     """
-    pose = frames["state"][:, :6].astype(np.float64)
+    pose = frames["state"][:, TCP_POSE].astype(np.float64)
     action = frames["action"].astype(np.float64)
     if target == "achieved":
         delta = np.roll(pose, -1, axis=0) - pose
     elif form == "abs":
         delta = action[:, :6] - pose
     else:
-        delta = action[:, :6] * ([POSITION_UNIT] * 3 + [ORIENTATION_UNIT] * 3)
-    delta[:, 3:] = wrap_angles(delta[:, 3:])
+        delta = action[:, :6] * POSE_UNITS
+    delta[:, 3:] = wrap_angle(delta[:, 3:])
     return np.concatenate([delta, action[:, 6:] > 0], axis=1).astype(np.float32)
 
 
@@ -87,23 +77,23 @@ class Windows:
     """Turns sampled frame numbers into batches of padded windows.
 
     Args:
-        root: the LeRobotDataset's folder.
-        features: its features (`dataset.meta.features`).
-        total_frames: frames in the whole dataset.
-        config: the policy's options.
+        root: The LeRobotDataset's folder.
+        features: Its features (`dataset.meta.features`).
+        total_frames: Frames in the whole dataset.
+        config: The policy's options.
 
     Attributes:
-        frames: the arrays of `load_frames`.
+        frames: The arrays of `load_frames`.
         targets: (T, 7) from `motion_targets`.
         has_target: (T,) bool, False for an episode's last frame with achieved targets.
         embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
-        clip_info: clip.json's contents, empty without `use_images`.
-        clip: the policy's choice of CLIP.
-        asked: the CALVIN tasks that each command asks for; empty unless `paraphrases` or the contrastive loss need
+        clip_info: Clip.json's contents, empty without `use_images`.
+        clip: The policy's choice of CLIP.
+        asked: The CALVIN tasks that each command asks for; empty unless `paraphrases` or the contrastive loss need
             them.
 
     Raises:
-        ValueError, FileNotFoundError: the dataset cannot be used; the message says why and what to do.
+        ValueError, FileNotFoundError: The dataset cannot be used; the message says why and what to do.
     """
 
     def __init__(self, root: Path, features: dict, total_frames: int, config: "LanSARConfig") -> None:
@@ -116,9 +106,7 @@ class Windows:
         if config.target == "achieved":
             self.has_target = rows < self.frames["end"] - 1
             if (self.frames["end"] - self.frames["first"] < 2).any():
-                raise ValueError(
-                    "--policy.target=achieved needs episodes of at least two frames; one is shorter."
-                )
+                raise ValueError("--policy.target=achieved needs episodes of at least two frames; one is shorter.")
         self.clip = config.clip
         self.arrays: dict[str, np.ndarray | Tensor] = {
             "state": self.frames["state"],
@@ -153,7 +141,7 @@ class Windows:
             index: (B,) absolute frame numbers.
 
         Raises:
-            IndexError: a number the dataset does not have.
+            IndexError: A number the dataset does not have.
         """
         known = self.frames["index"]
         row = np.searchsorted(known, index)
@@ -176,7 +164,7 @@ class Windows:
             index: (B,) absolute frame numbers.
 
         Returns:
-            state (B, n, 15), environment_state (B, n, 24), target (B, n, 7) float32, valid_steps (N,) int64, the
+            State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) float32, valid_steps (N,) int64, the
             places of the steps that are no padding among the B * n, and with `use_images` static and gripper
             (B, n, D) float32. Padded steps repeat the window's last step. On a GPU if the frames fit there.
         """

@@ -1,4 +1,4 @@
-"""``lansar-report``: the tables and plots of one evaluation."""
+"""`lansar-report`: the tables and plots of one evaluation."""
 
 import json
 import sys
@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-from draccus.utils import DraccusException
 
+from lerobot_lansar.command import run_command
 from lerobot_lansar.report.results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
 
 
@@ -30,17 +30,17 @@ class ReportConfig:
 
 
 def report(config: ReportConfig) -> dict[str, Any]:
-    """Writes ``report.json``, ``report.md``, ``tasks.png`` and, for chains, ``in_a_row.png``.
+    """Writes `report.json`, `report.md`, `tasks.png` and, for chains, `in_a_row.png`.
 
     Args:
-        config: the command's options.
+        config: The command's options.
 
     Returns:
-        What ``report.json`` holds: the figures of ``summarise``, notes and the package's version.
+        What `report.json` holds: the figures of `summarise`, notes and the package's version.
 
     Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is malformed, or the files are not of one evaluation.
+        FileNotFoundError: A file is missing.
+        ValueError: A file is malformed, or the files are not of one evaluation.
     """
     results_dir = config.results_dir or config.eval_dir
     if not results_dir.is_dir():
@@ -85,9 +85,7 @@ def _notes(summary: dict[str, Any], named: bool) -> list[str]:
         desk = "the built-in desk" if assets == "built-in" else "a desk that the files do not name"
         notes.append(f"Measured on {desk}: not comparable with published CALVIN numbers.")
     if summary["policy_reads_scene_state"]:
-        notes.append(
-            "The policy reads the simulator's own scene state (privileged), which a real robot has not."
-        )
+        notes.append("The policy reads the simulator's own scene state (privileged), which a real robot has not.")
     elif summary["policy_reads_scene_state"] is None:
         notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
     if "in_a_row" in summary and not named:
@@ -104,7 +102,7 @@ def as_markdown(summary: dict[str, Any]) -> str:
     """The report as text.
 
     Args:
-        summary: what :func:`report` returns.
+        summary: What `report` returns.
     """
     known = {key: value for key, value in summary["settings"].items() if value is not None}
     first, last = summary["seeds"]
@@ -123,9 +121,7 @@ def as_markdown(summary: dict[str, Any]) -> str:
         f"| {'-' * width} | --------- | -------- | ------- |",
     ]
     for task, c in summary["tasks"].items():
-        lines.append(
-            f"| {task:{width}} | {c['successes']:9} | {c['attempts']:8} | {100 * c['rate']:5.1f} % |"
-        )
+        lines.append(f"| {task:{width}} | {c['successes']:9} | {c['attempts']:8} | {100 * c['rate']:5.1f} % |")
     lines += [
         "",
         f"Local success rate (all attempted commands): {100 * summary['local_success_rate']:.2f} %",
@@ -134,17 +130,16 @@ def as_markdown(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
-    """Runs the command; returns 0, or 2 after an error the user can mend."""
-    try:
-        config = draccus.parse(ReportConfig)
-        summary = report(config)
-    except (OSError, ValueError, DraccusException) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(as_markdown(summary))
+@draccus.wrap()
+def run(config: ReportConfig) -> None:
+    """Reports, prints the report and says where it is."""
+    print(as_markdown(report(config)))
     print(f"report.json, report.md and the plots are in {config.output_dir or config.eval_dir}")
-    return 0
+
+
+def main() -> int:
+    """Entry point of `lansar-report`."""
+    return run_command("lansar-report", run)
 
 
 if __name__ == "__main__":

@@ -1,21 +1,22 @@
-"""From what ``lerobot-eval`` leaves behind to success rates.
+"""From what `lerobot-eval` leaves behind to success rates.
 
-``eval_info.json`` is enough: an episode's sum of rewards is the number of commands it fulfilled in a row, and
-which chain it ran follows from its seed. Where the environment also wrote ``episodes-*.jsonl``
-(``--env.results_dir``), those lines tell which commands were attempted, under which settings, and are held
-against ``eval_info.json``.
+`eval_info.json` is enough: an episode's sum of rewards is the number of commands it fulfilled in a row, and
+which chain it ran follows from its seed. Where the environment also wrote `episodes-*.jsonl`
+(`--env.results_dir`), those lines tell which commands were attempted, under which settings, and are held
+against `eval_info.json`.
 """
 
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-CHAIN_LENGTH = 5
+from ..benchmark import LH_MTLC, load_chains
+from ..calvin import CHAIN_LENGTH, TASKS
+
 DEFAULT_SEED = 1000
-"""LeRobot's own default of ``--seed``."""
+"""LeRobot's own default of `--seed`."""
 
 SETTINGS = (
     "scene",
@@ -35,9 +36,9 @@ class Episode:
 
     Attributes:
         commands: (task name, fulfilled) of each; all but the last are fulfilled.
-        seed: the episode's reset seed.
-        chain: number of the chain, or None for a single task.
-        settings: those of :data:`SETTINGS` that are known.
+        seed: The episode's reset seed.
+        chain: Number of the chain, or None for a single task.
+        settings: Those of `SETTINGS` that are known.
     """
 
     commands: list[tuple[str, bool]]
@@ -51,22 +52,15 @@ class Episode:
         return sum(fulfilled for _, fulfilled in self.commands)
 
 
-@cache
-def benchmark_chains() -> list[list[str]]:
-    """The five task names of each of CALVIN's 1000 chains."""
-    path = Path(__file__).parents[1] / "envs" / "chains.json"
-    return [chain["tasks"] for chain in json.loads(path.read_text())]
-
-
 def read_eval_info(eval_dir: Path) -> list[dict[str, Any]]:
-    """Reads the evaluated environments' entries of ``eval_info.json``.
+    """Reads the evaluated environments' entries of `eval_info.json`.
 
     Returns:
         [{"task_group": str, "sum_rewards": [number per episode]}].
 
     Raises:
-        FileNotFoundError: the evaluation has not finished or is elsewhere.
-        ValueError: it is not LeRobot's file.
+        FileNotFoundError: The evaluation has not finished or is elsewhere.
+        ValueError: It is not LeRobot's file.
     """
     path = eval_dir / "eval_info.json"
     if not path.is_file():
@@ -88,10 +82,10 @@ def read_eval_info(eval_dir: Path) -> list[dict[str, Any]]:
 
 
 def read_lines(folder: Path) -> list[Episode]:
-    """Reads the environment's own lines, ``episodes-*.jsonl``; empty if there are none.
+    """Reads the environment's own lines, `episodes-*.jsonl`; empty if there are none.
 
     Raises:
-        ValueError: a line is not what the environment writes.
+        ValueError: A line is not what the environment writes.
     """
     episodes = []
     for path in sorted(folder.glob("episodes-*.jsonl")):
@@ -120,23 +114,23 @@ def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | Non
     """Brings both sources together.
 
     Args:
-        entries: of :func:`read_eval_info`.
-        lines: of :func:`read_lines`; they may hold more episodes than counted, as the last batch is full.
-        seed: the evaluation's ``--seed``; None: the smallest one in the lines, or LeRobot's default.
+        entries: Of `read_eval_info`.
+        lines: Of `read_lines`; they may hold more episodes than counted, as the last batch is full.
+        seed: The evaluation's `--seed`; None: the smallest one in the lines, or LeRobot's default.
 
     Returns:
         The counted episodes.
 
     Raises:
-        ValueError: the sources contradict each other, or something cannot be told without the lines.
+        ValueError: The sources contradict each other, or something cannot be told without the lines.
     """
     episodes = []
     for entry in entries:
         group = entry["task_group"]
-        task = group if _is_task(group) else None
+        task = group if group in TASKS else None
         # One task per entry, or one entry for all lines: chains, or a single task in a group of another name.
         own = [line for line in lines if task is None or (line.chain is None and line.commands[0][0] == task)]
-        if group == "lh_mtlc":
+        if group == LH_MTLC:
             own = [line for line in own if line.chain is not None]
         first = seed if seed is not None else min((line.seed for line in own), default=DEFAULT_SEED)
         by_seed: dict[int, Episode] = {}
@@ -158,20 +152,15 @@ def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | Non
     return episodes
 
 
-def _is_task(name: str) -> bool:
-    return any(name in chain for chain in benchmark_chains())
-
-
 def _from_reward(rewards: float, seed: int, task: str | None) -> Episode:
     fulfilled = int(rewards)
     if fulfilled != rewards or not 0 <= fulfilled <= (CHAIN_LENGTH if task is None else 1):
-        raise ValueError(
-            f"sum of rewards {rewards} in eval_info.json: not an evaluation of the CALVIN environment"
-        )
+        raise ValueError(f"sum of rewards {rewards} in eval_info.json: not an evaluation of the CALVIN environment")
     if task is not None:
         return Episode([(task, bool(fulfilled))], seed, None)
-    chain = seed % len(benchmark_chains())
-    attempted = benchmark_chains()[chain][: fulfilled + 1]
+    chains = load_chains()
+    chain = seed % len(chains)
+    attempted = chains[chain].tasks[: fulfilled + 1]
     return Episode([(name, i < fulfilled) for i, name in enumerate(attempted)], seed, chain)
 
 
@@ -195,8 +184,7 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
         "seeds": [min(e.seed for e in episodes), max(e.seed for e in episodes)],
         "settings": {key: _agreed(e.settings.get(key) for e in episodes) for key in SETTINGS},
         "tasks": dict(sorted(tasks.items(), key=lambda item: (-item[1]["rate"], item[0]))),
-        "local_success_rate": sum(c["successes"] for c in tasks.values())
-        / sum(c["attempts"] for c in tasks.values()),
+        "local_success_rate": sum(c["successes"] for c in tasks.values()) / sum(c["attempts"] for c in tasks.values()),
     }
     if all(episode.chain is not None for episode in episodes):
         rows = range(1, CHAIN_LENGTH + 1)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_convert.checks import SCENE_BLOCK_ORDER, relative_actions
+from lerobot_lansar.calvin import BLOCK_ORDER, relative_action
 
 COMMANDS = {
     "lift_red_block_table": "pick up the red block",
@@ -20,9 +20,9 @@ class FakeCalvin:
     """Where the split is and what was written.
 
     Attributes:
-        root: the dataset's folder.
+        root: The dataset's folder.
         windows: (start, end, task, sentence) of each window.
-        frames: frame number -> what its file holds.
+        frames: Frame number -> what its file holds.
     """
 
     root: Path
@@ -51,21 +51,21 @@ def write_calvin(
     overlap: int = 0,
     seed: int = 0,
 ) -> FakeCalvin:
-    """Writes one recording whose windows carry out ``tasks`` one after the other.
+    """Writes one recording whose windows carry out `tasks` one after the other.
 
     Args:
-        root: folder to create.
-        rgb: write pictures too.
-        depth, tactile: write distances, and the fingertip sensors' pictures.
-        scene: letter of the scene.
-        block_order: colours of the block columns; the scene's own order by default.
-        tasks: one per window.
-        length: frames of a window.
-        overlap: frames that successive windows share.
-        seed: of all random numbers.
+        root: Folder to create.
+        rgb: Write pictures too.
+        depth, tactile: Write distances, and the fingertip sensors' pictures.
+        scene: Letter of the scene.
+        block_order: Colours of the block columns; the scene's own order by default.
+        tasks: One per window.
+        length: Frames of a window.
+        overlap: Frames that successive windows share.
+        seed: Of all random numbers.
     """
     rng = np.random.default_rng(seed)
-    order = block_order or SCENE_BLOCK_ORDER[scene]
+    order = block_order or BLOCK_ORDER[scene]
     folder = root / "training"
     (folder / "lang_annotations").mkdir(parents=True)
     first, step = 100, length - overlap
@@ -84,7 +84,7 @@ def write_calvin(
             column = order.index(task.split("_")[1])
             scene_obs[start : start + length, 6 + 6 * column + 2] += np.linspace(0, 0.2, length)
         windows.append((first + start, first + start + length, task, COMMANDS[task]))
-    rel_actions = relative_actions(actions, robot_obs)
+    rel_actions = relative_action(actions, robot_obs)
     frames = {}
     background = rng.integers(0, 80, size=3)
     for i in range(total):
@@ -101,22 +101,18 @@ def write_calvin(
         shade = np.linspace(0, 1, 200)[:, None]
         if depth:
             for name, size, near in (("depth_static", 200, 3.5), ("depth_gripper", 84, 0.05)):
-                content[name] = (near + 0.2 * shade[:size] + 0.01 * i + np.zeros((size, size))).astype(
-                    np.float32
-                )
+                content[name] = (near + 0.2 * shade[:size] + 0.01 * i + np.zeros((size, size))).astype(np.float32)
         if tactile:
             content["rgb_tactile"] = np.full((160, 120, 6), 40 + i % 50, np.uint8)
             content["rgb_tactile"][..., 3:] += 60
-            content["depth_tactile"] = (
-                1e-4 * shade[:160, :, None] * [i, 2.0 * i] + np.zeros((160, 120, 2))
-            ).astype(np.float32)
+            content["depth_tactile"] = (1e-4 * shade[:160, :, None] * [i, 2.0 * i] + np.zeros((160, 120, 2))).astype(
+                np.float32
+            )
         frames[first + i] = content
         np.savez(folder / f"episode_{first + i:07d}.npz", **content)
     np.save(folder / "ep_start_end_ids.npy", np.array([[first, first + total - 1]]))
     np.save(folder / "ep_lens.npy", np.array([total]))
-    np.save(
-        folder / "scene_info.npy", {f"calvin_scene_{scene}": [first, first + total - 1]}, allow_pickle=True
-    )
+    np.save(folder / "scene_info.npy", {f"calvin_scene_{scene}": [first, first + total - 1]}, allow_pickle=True)
     annotations = {
         "language": {
             "ann": [sentence for *_, sentence in windows],

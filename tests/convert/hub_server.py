@@ -43,11 +43,11 @@ class Hub:
     """The server; a context manager.
 
     Attributes:
-        url: for HF_ENDPOINT.
+        url: For HF_ENDPOINT.
         repositories: "user/name" -> repository.
         uploads: SHA-256 of every large object that was sent, in order.
-        fail_after: refuse large objects after so many; None: never.
-        delay: seconds that receiving a large object takes.
+        fail_after: Refuse large objects after so many; None: never.
+        delay: Seconds that receiving a large object takes.
     """
 
     def __init__(self) -> None:
@@ -72,9 +72,7 @@ class Hub:
 
     def files(self, repo_id: str) -> dict[str, bytes]:
         """The newest commit's files."""
-        return {
-            path: self.content(entry) for path, entry in self.repositories[repo_id].commits[-1][1].items()
-        }
+        return {path: self.content(entry) for path, entry in self.repositories[repo_id].commits[-1][1].items()}
 
     def content(self, entry: tuple[str, int, str | None]) -> bytes:
         """A file's bytes."""
@@ -116,19 +114,14 @@ class _Handler(BaseHTTPRequestHandler):
             for method, pattern, name in self.ROUTES:
                 found = re.fullmatch(pattern, path)
                 if found and re.fullmatch(method, self.command):
-                    if (
-                        not name.startswith("lfs_p")
-                        and self.headers.get("Authorization") != f"Bearer {TOKEN}"
-                    ):
+                    if not name.startswith("lfs_p") and self.headers.get("Authorization") != f"Bearer {TOKEN}":
                         raise _Refused(401, "no token")
                     parts = [unquote(part) if part else part for part in found.groups()]
                     with self.hub.lock:
                         return getattr(self, name)(body, *parts)
             raise _Refused(404, f"the test hub does not know {self.command} {path}")
         except _Refused as error:
-            self._answer(
-                {"error": str(error)}, error.status, {"X-Error-Code": error.code} if error.code else {}
-            )
+            self._answer({"error": str(error)}, error.status, {"X-Error-Code": error.code} if error.code else {})
 
     do_GET = do_POST = do_PUT = do_DELETE = do_HEAD = _serve
 

@@ -16,6 +16,7 @@ from numpy._core.numeric import _frombuffer
 
 from dataset_convert import checks
 from dataset_convert.calvin import VECTORS, CalvinSplit, load_object_array
+from lerobot_lansar.calvin import relative_action
 
 INDEX_FILES = ("scene_info.npy", "ep_start_end_ids.npy", "lang_annotations/auto_lang_ann.npy")
 
@@ -89,8 +90,12 @@ def test_index_files_of_all_numpy_and_pickle_versions_load(tmp_path, protocol, w
         objects[divmod(place, 3)] = item
     twice = np.arange(5)
     stored = {
-        "arrays": ARRAYS, "scalars": SCALARS, "plain": PLAIN, "objects": objects, "twice": [twice, (twice,)],
-    }  # fmt: skip
+        "arrays": ARRAYS,
+        "scalars": SCALARS,
+        "plain": PLAIN,
+        "objects": objects,
+        "twice": [twice, (twice,)],
+    }
     pickled = pickle.dumps(np.array(stored, dtype=object), protocol=protocol)
     loaded = load_object_array(write_index(tmp_path / "index.npy", written(pickled)))
     assert list(loaded) == list(stored)
@@ -222,7 +227,7 @@ def test_a_flipped_byte_inside_a_frame_is_noticed(calvin):
 
 
 def outcomes_of_flips(path, attempt, named, count):
-    """How often ``attempt`` succeeds after one bit of the file was flipped; where it fails, the error names a file."""
+    """How often `attempt` succeeds after one bit of the file was flipped; where it fails, the error names a file."""
     content = path.read_bytes()
     rng = np.random.default_rng(0)
     successes = 0
@@ -400,14 +405,14 @@ def test_relative_actions_wrap_angles_and_clip():
     actions = np.array([[0.01, -1.0, 0.0, -3.13, 3.13, 0.025, -1.0]])
     turn = 2 * np.pi - 6.26
     expected = [[0.5, -1, 0, turn / 0.05, -turn / 0.05, 0.5, -1]]
-    np.testing.assert_allclose(checks.relative_actions(actions, robot_obs), expected, atol=1e-12)
+    np.testing.assert_allclose(relative_action(actions, robot_obs), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_half_a_turn_may_be_stored_with_either_sign(calvin, sign):
     robot_obs, actions = calvin.frames[103]["robot_obs"].copy(), calvin.frames[103]["actions"].copy()
     actions[4] = robot_obs[4] + np.pi
-    rel = checks.relative_actions(actions[None], robot_obs[None])[0]
+    rel = relative_action(actions[None], robot_obs[None])[0]
     rel[4] = sign
     calvin.rewrite(103, actions=actions, rel_actions=rel)
     read_all(calvin)
@@ -434,9 +439,7 @@ def test_lifts_overrule_a_known_block_order(tmp_path):
 def test_an_unknown_scene_needs_lifts_to_tell_its_blocks_apart(tmp_path):
     lifted = write_calvin(tmp_path / "lifts", scene="X", block_order=("blue", "pink", "red"))
     assert order_of(lifted, "X") == ("blue", "pink", "red")
-    silent = write_calvin(
-        tmp_path / "silent", scene="X", block_order=("blue", "pink", "red"), tasks=("open_drawer",)
-    )
+    silent = write_calvin(tmp_path / "silent", scene="X", block_order=("blue", "pink", "red"), tasks=("open_drawer",))
     with pytest.raises(ValueError, match=r"scene X: cannot tell.*known order: none"):
         order_of(silent, "X")
 

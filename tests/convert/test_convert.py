@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 from fake_calvin import COMMANDS, write_calvin
 
-from dataset_convert import checks, convert, publish
-from dataset_convert.calvin import COLOURS, TASKS, CalvinSplit
+from dataset_convert import convert
+from dataset_convert.calvin import CalvinSplit
 from dataset_convert.convert import ClipOptions, ConvertConfig
+from lerobot_lansar.calvin import COLORS, TASKS, relative_action
+from lerobot_lansar.jobs import staging
 
 
 def options(calvin, output_dir, **changes):
@@ -51,7 +53,7 @@ def test_every_item_is_the_source_frame_with_its_command(tmp_path):
             np.testing.assert_array_equal(item["observation.state"], source["robot_obs"].astype(np.float32))
             stored = item["observation.environment_state"].numpy()
             blocks = dict(zip(("pink", "blue", "red"), source["scene_obs"][6:].reshape(3, 6), strict=True))
-            expected = np.concatenate([source["scene_obs"][:6], *(blocks[colour] for colour in COLOURS)])
+            expected = np.concatenate([source["scene_obs"][:6], *(blocks[colour] for colour in COLORS)])
             np.testing.assert_array_equal(stored, expected.astype(np.float32))
             index += 1
 
@@ -84,7 +86,7 @@ def test_the_commanded_task_is_told_in_the_state_on_request(calvin, tmp_path):
         expected = np.zeros(34)
         window = item["calvin.window"].item()
         if window >= 0:
-            expected[TASKS.index(calvin.windows[window][2])] = 1
+            expected[list(TASKS).index(calvin.windows[window][2])] = 1
         np.testing.assert_array_equal(state[24:], expected)
         scene = calvin.frames[item["calvin.frame"].item()]["scene_obs"].astype(np.float32)
         np.testing.assert_array_equal(state[:24], scene)
@@ -162,9 +164,7 @@ def converting(calvin, out, workers):
     """The command in a process group of its own."""
     command = [sys.executable, "-m", "dataset_convert", f"--root={calvin.root}", "--repo_id=me/desk"]
     command += [f"--output_dir={out}", "--images=none", f"--workers={workers}"]
-    return subprocess.Popen(
-        command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-    )
+    return subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
 
 def wait_for(condition, seconds=120):
@@ -258,16 +258,22 @@ def reads(pid, path):
         return False
 
 
+def any_file(folder):
+    return any(folder.glob("*/*"))
+
+
 def test_two_runs_cannot_write_the_same_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr("dataset_convert.publish._PATIENCE", 0.2)
-    with publish.staging(tmp_path / "out", {"a": 1}) as first:
-        (first / "dataset" / "kept").touch()
+    monkeypatch.setattr("lerobot_lansar.jobs.staging._PATIENCE", 0.2)
+    folder, out = tmp_path / ".out.incomplete", tmp_path / "out"
+    with staging.staging(folder, out, {"a": 1}, any_file):
+        (folder / "dataset").mkdir()
+        (folder / "dataset" / "kept").touch()
         with (
             pytest.raises(ValueError, match="another process is writing"),
-            publish.staging(tmp_path / "out", {}),
+            staging.staging(folder, out, {}, any_file),
         ):
             pass
-        publish.publish(first, tmp_path / "out")
+        staging.publish(folder, folder / "dataset", out)
     assert (tmp_path / "out" / "kept").exists()
     assert os.listdir(tmp_path) == ["out"]
 
@@ -277,7 +283,7 @@ def test_a_run_killed_just_after_it_published_is_in_nobodys_way(calvin, tmp_path
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(publish, "shutil", SimpleNamespace(rmtree=killed))
+        patch.setattr(staging, "shutil", SimpleNamespace(rmtree=killed))
         with pytest.raises(KeyboardInterrupt):
             convert.convert(options(calvin, tmp_path / "out"))
     whole = files_of(tmp_path / "out")
@@ -288,7 +294,6 @@ def test_a_run_killed_just_after_it_published_is_in_nobodys_way(calvin, tmp_path
 
     shutil.rmtree(tmp_path / "out")
     shutil.copytree(tmp_path / "leftover", leftover)
-    publish.mark_submitted(leftover)  # as it would be had Slurm's last job been killed
     assert load(convert.convert(options(calvin, tmp_path / "out", action="abs"))).num_frames == 48
     shutil.rmtree(tmp_path / "out")
     shutil.copytree(tmp_path / "leftover", leftover)
@@ -297,16 +302,18 @@ def test_a_run_killed_just_after_it_published_is_in_nobodys_way(calvin, tmp_path
 
 
 def test_a_submission_that_fails_does_not_count_as_one(tmp_path):
+    folder = tmp_path / ".out.incomplete"
+
     def submit():
-        with publish.staging(tmp_path / "out", {"a": 1}) as folder:
+        with staging.staging(folder, tmp_path / "out", {"a": 1}, any_file, submitting=True):
+            (folder / "shards").mkdir(exist_ok=True)
             (folder / "shards" / "000000.json").touch()  # a shard of an earlier try, which must not be lost
-            publish.mark_submitted(folder)
             raise RuntimeError
 
     for _ in range(2):
         with pytest.raises(RuntimeError):
             submit()
-    assert (tmp_path / ".out.incomplete" / "shards" / "000000.json").exists()
+    assert (folder / "shards" / "000000.json").exists()
 
 
 def test_the_same_request_again_changes_nothing_and_another_one_is_refused(calvin, tmp_path):
@@ -364,9 +371,7 @@ def test_the_command_converts_and_says_where(calvin, tmp_path, monkeypatch, caps
         (["--images=none", "--split=training", "--exclude_shared=perhaps"], "exclude_shared"),
     ],
 )
-def test_a_wrong_option_is_one_clear_message_and_exit_code_2(
-    calvin, tmp_path, monkeypatch, capsys, arguments, message
-):
+def test_a_wrong_option_is_one_clear_message_and_exit_code_2(calvin, tmp_path, monkeypatch, capsys, arguments, message):
     base = [f"--root={calvin.root}", "--repo_id=me/desk", f"--output_dir={tmp_path / 'out'}"]
     code, printed = run_main(monkeypatch, capsys, *base, *arguments)
     assert code == 2
@@ -383,7 +388,7 @@ def test_without_a_folder_it_goes_where_lerobot_looks(calvin, tmp_path, monkeypa
 
 
 def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_path):
-    clip_module = pytest.importorskip("lerobot_lansar.policy.clip")
+    clip_module = pytest.importorskip("lerobot_lansar.clip.model")
     import torch
 
     calvin = write_calvin(tmp_path / "calvin", rgb=True, overlap=3, length=5)
@@ -398,7 +403,7 @@ def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_p
             picture = calvin.frames[frames[index]][camera][None]
             expected = clip.encode_images(torch.from_numpy(picture))[0].numpy()
             np.testing.assert_allclose(stored[index], expected, atol=2e-3)
-    from lerobot_lansar.policy.frames import dataset_fingerprint
+    from lerobot_lansar.clip.store import dataset_fingerprint
 
     description = json.loads((out / "clip" / "clip.json").read_text())
     assert description["frames"] == len(frames)
@@ -406,7 +411,7 @@ def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_p
 
 
 def test_an_unknown_clip_is_reported_before_the_long_part(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("lerobot_lansar.policy.clip")
+    pytest.importorskip("lerobot_lansar.clip.model")
     calvin = write_calvin(tmp_path / "calvin", rgb=True, tasks=("open_drawer",), length=2)
     monkeypatch.setattr(convert, "run_shards", lambda *_, **__: pytest.fail("converted first"))
     base = [f"--root={calvin.root}", "--repo_id=me/desk", f"--output_dir={tmp_path / 'out'}", "--embed=true"]
@@ -418,5 +423,5 @@ def test_an_unknown_clip_is_reported_before_the_long_part(tmp_path, monkeypatch,
 def test_actions_in_the_dataset_are_consistent_with_its_states(calvin, tmp_path):
     dataset = load(convert.convert(options(calvin, tmp_path / "out")))
     rows = dataset.hf_dataset.with_format("numpy")[:]
-    expected = checks.relative_actions(rows["calvin.actions"], rows["observation.state"])
+    expected = relative_action(rows["calvin.actions"], rows["observation.state"])
     np.testing.assert_allclose(rows["action"], expected, atol=1e-4)

@@ -1,4 +1,4 @@
-"""``lansar-embed`` on a finished dataset."""
+"""`lansar-embed` on a finished dataset."""
 
 import json
 import shutil
@@ -14,8 +14,9 @@ from dataset_convert import embed
 from dataset_convert.convert import ClipOptions, ConvertConfig, convert
 from dataset_convert.shards import sha256
 from dataset_convert.verify import Mismatch, VerifyConfig, verify
+from lerobot_lansar.clip import store
 
-clip_module = pytest.importorskip("lerobot_lansar.policy.clip")
+clip_module = pytest.importorskip("lerobot_lansar.clip.model")
 
 TINY = ClipOptions(model="lansar-tiny", pretrained="")
 ARGUMENTS = ["--repo_id=me/desk", "--clip.model=lansar-tiny", "--clip.pretrained="]
@@ -98,16 +99,14 @@ def test_an_interrupted_pass_goes_on(made, run, tmp_path, monkeypatch):
     assert not {name for name in uploaded if "clip" in name}, "but a push to the hub would leave it alone"
 
     encoded.clear()
-    monkeypatch.setattr(
-        clip_module.Clip, "encode_images", lambda self, p: (encoded.append(len(p)), encode(self, p))[1]
-    )
+    monkeypatch.setattr(clip_module.Clip, "encode_images", lambda self, p: (encoded.append(len(p)), encode(self, p))[1])
     code, printed = run(dataset, "--batch_size=4")
     assert code == 0, printed.err
     assert sum(encoded) == 2 * (32 - 12)
     for name in FILES:
         mine, sources = np.load(dataset / name).astype(float), np.load(made / "png" / name).astype(float)
         np.testing.assert_allclose(mine, sources, atol=2e-3)
-    assert not (dataset / embed.PARTIAL).exists()
+    assert not (dataset / store.PARTIAL).exists()
 
 
 class Killed(BaseException):
@@ -116,7 +115,7 @@ class Killed(BaseException):
 
 @pytest.mark.parametrize(
     ("step", "name"),
-    [("write_text", "clip.json"), ("rename", embed.PARTIAL.name), ("unlink", "state.json")],
+    [("write_text", "clip.json"), ("rename", store.PARTIAL.name), ("unlink", "state.json")],
     ids=["before it is described", "before it is published", "before it is tidied"],
 )
 def test_a_kill_in_the_last_steps_loses_nothing(made, run, tmp_path, monkeypatch, step, name):
@@ -135,7 +134,7 @@ def test_a_kill_in_the_last_steps_loses_nothing(made, run, tmp_path, monkeypatch
     monkeypatch.setattr(clip_module.Clip, "encode_images", lambda *_: pytest.fail("embedded again"))
     code, printed = run(dataset)
     assert code == 0, printed.err
-    assert not (dataset / embed.PARTIAL).exists()
+    assert not (dataset / store.PARTIAL).exists()
     assert {path.name for path in (dataset / "clip").iterdir()} == {
         "clip.json",
         *(Path(name).name for name in FILES),
@@ -147,9 +146,9 @@ def test_a_kill_in_the_last_steps_loses_nothing(made, run, tmp_path, monkeypatch
 
 def test_what_another_clip_began_is_not_continued(made, run, tmp_path):
     dataset = without_clip(made, "png", tmp_path)
-    (dataset / embed.PARTIAL).mkdir(parents=True)
+    (dataset / store.PARTIAL).mkdir(parents=True)
     state = {"description": {"model": "other"}, "done": 30}
-    (dataset / embed.PARTIAL / "state.json").write_text(json.dumps(state))
+    (dataset / store.PARTIAL / "state.json").write_text(json.dumps(state))
     code, printed = run(dataset)
     assert code == 0, printed.err
     assert all(np.load(dataset / name).any(axis=1).all() for name in FILES)

@@ -10,11 +10,12 @@ import pytest
 from fake_calvin import COMMANDS, write_calvin
 
 from dataset_convert import checks, convert, episodes
-from dataset_convert.calvin import SCENES, TASKS, CalvinSplit, Window
+from dataset_convert.calvin import CalvinSplit, Window
 from dataset_convert.convert import ConvertConfig
 from dataset_convert.episodes import NO_COMMAND, window_spans
 from dataset_convert.shards import cut_into_shards
 from dataset_convert.writer import EpisodeStats, Picture
+from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 
 
 def options(calvin, output_dir, **changes):
@@ -69,9 +70,13 @@ def test_play_has_every_frame_once_and_windows_as_annotations(calvin, tmp_path):
     assert windows.tolist() == expected
     sentences = [COMMANDS["open_drawer"], "close_drawer", COMMANDS["open_drawer"], NO_COMMAND]
     assert [dataset[i]["task"] for i in range(48)] == [sentences[w] for w in expected]
-    numbers = {0: TASKS.index("open_drawer"), 1: TASKS.index("close_drawer"), 2: TASKS.index("open_drawer")}
+    numbers = {
+        0: list(TASKS).index("open_drawer"),
+        1: list(TASKS).index("close_drawer"),
+        2: list(TASKS).index("open_drawer"),
+    }
     assert column(dataset, "calvin.task").tolist() == [numbers.get(w, -1) for w in expected]
-    assert set(column(dataset, "calvin.scene").tolist()) == {SCENES.index("D")}
+    assert set(column(dataset, "calvin.scene").tolist()) == {SCENE_NAMES.index("D")}
     assert [e["windows"] for e in manifest_of(out)["episodes"]] == [[0, 1], [2]]
     assert dataset.meta.episodes[0]["tasks"] == [NO_COMMAND, sentences[0], sentences[1]]
     card = (out / "README.md").read_text()
@@ -102,9 +107,7 @@ def test_dedup_keeps_as_many_windows_as_it_can():
 def test_dedup_is_the_best_choice_of_all(seed):
     rng = np.random.default_rng(seed)
     starts = rng.integers(0, 30, 9)
-    windows = [
-        Window(int(s), int(s + n), "t", "t", "D") for s, n in zip(starts, rng.integers(1, 12, 9), strict=True)
-    ]
+    windows = [Window(int(s), int(s + n), "t", "t", "D") for s, n in zip(starts, rng.integers(1, 12, 9), strict=True)]
 
     def most(numbers, free_from):
         later = [n for n in numbers if windows[n].start >= free_from]
@@ -112,9 +115,7 @@ def test_dedup_is_the_best_choice_of_all(seed):
 
     kept = window_spans(windows, "frames", [])
     assert len(kept) == most(range(9), 0)
-    for a, b in zip(
-        sorted(kept, key=lambda s: s.start), sorted(kept, key=lambda s: s.start)[1:], strict=False
-    ):
+    for a, b in zip(sorted(kept, key=lambda s: s.start), sorted(kept, key=lambda s: s.start)[1:], strict=False):
         assert a.end <= b.start
 
 
@@ -165,9 +166,7 @@ DEFECTS = {
     "a number too large for float32": lambda calvin, n: calvin.rewrite(n, scene_obs=np.full(24, 1e39)),
     "a wrong relative action": lambda calvin, n: calvin.rewrite(n, rel_actions=np.full(7, 0.2)),
     "a wrong shape": lambda calvin, n: calvin.rewrite(n, scene_obs=np.zeros(23)),
-    "a picture of a wrong size": lambda calvin, n: calvin.rewrite(
-        n, rgb_static=np.zeros((200, 199, 3), np.uint8)
-    ),
+    "a picture of a wrong size": lambda calvin, n: calvin.rewrite(n, rgb_static=np.zeros((200, 199, 3), np.uint8)),
     "no picture": lambda calvin, n: calvin.rewrite(n, rgb_gripper=None),
 }
 
@@ -175,9 +174,7 @@ DEFECTS = {
 @pytest.mark.parametrize("frame", [100, 112, 113, 123], ids="frame {}".format)
 @pytest.mark.parametrize("defect", DEFECTS)
 @pytest.mark.parametrize("mode", ["windows", "play"])
-def test_a_defective_episode_stops_the_conversion_or_is_left_out(
-    tmp_path, monkeypatch, capsys, defect, mode, frame
-):
+def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monkeypatch, capsys, defect, mode, frame):
     """Whichever of its frames it is: others are read before, the first and the last of a lift among them."""
     monkeypatch.setattr("dataset_convert.shards.BLOCK", 5)  # it is found after a part was written
     if mode == "windows":  # good and bad ones in one file; in play a file each
@@ -235,9 +232,7 @@ def test_lifts_of_one_colour_or_none_leave_the_known_order():
 
 
 def test_depth_and_touch_on_request(tmp_path):
-    calvin = write_calvin(
-        tmp_path / "calvin", rgb=True, depth=True, tactile=True, tasks=("open_drawer",), length=8
-    )
+    calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tactile=True, tasks=("open_drawer",), length=8)
     for images, tolerance in (("video", 2e-3), ("png", 0)):
         out = convert.convert(options(calvin, tmp_path / images, images=images, depth=True, tactile=True))
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -268,9 +263,7 @@ def test_depth_and_touch_on_request(tmp_path):
 def test_a_distance_that_a_depth_video_cannot_hold_makes_an_episode_defective(tmp_path):
     calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tasks=("open_drawer",) * 2, length=3)
     calvin.rewrite(101, depth_static=np.full((200, 200), 11, np.float32))
-    with pytest.raises(
-        ValueError, match=r"episode_0000101.*depth_static.* of 11 to 11 m do not fit .*--images=png"
-    ):
+    with pytest.raises(ValueError, match=r"episode_0000101.*depth_static.* of 11 to 11 m do not fit .*--images=png"):
         convert.convert(options(calvin, tmp_path / "out", images="video", depth=True))
     exact = convert.convert(options(calvin, tmp_path / "exact", images="png", depth=True))
     assert load(exact)[1]["observation.images.static_depth"].max() == 11_000, "LeRobot gives millimetres"
@@ -357,7 +350,7 @@ def test_random_folders_convert_exactly(tmp_path, seed):
     rng = np.random.default_rng(seed)
     tasks = tuple(rng.choice(list(COMMANDS), rng.integers(2, 6)))
     length = int(rng.integers(4, 12))
-    scene, overlap = str(rng.choice(list(SCENES))), int(rng.integers(0, length // 2))
+    scene, overlap = str(rng.choice(list(SCENE_NAMES))), int(rng.integers(0, length // 2))
     calvin = write_calvin(
         tmp_path / "calvin", rgb=True, scene=scene, tasks=tasks, length=length, overlap=overlap, seed=seed
     )

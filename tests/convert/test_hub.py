@@ -37,7 +37,7 @@ huggingface_hub.set_client_factory(
 from dataset_convert.convert import main
 sys.exit(main())
 """
-"""``lansar-convert`` with the one address that the hub's client has written into its code, that of the card's check
+"""`lansar-convert` with the one address that the hub's client has written into its code, that of the card's check
 (huggingface_hub 1.x asks https://huggingface.co whatever HF_ENDPOINT says), led to the loopback too."""
 
 
@@ -96,9 +96,16 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
     clip = ClipOptions(model="lansar-tiny", pretrained="")
     out = convert.convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", embed=True, clip=clip))
     arguments = [
-        "lansar-convert", f"--root={calvin.root}", "--repo_id=me/desk", f"--output_dir={out}", "--embed=true",
-        "--clip.model=lansar-tiny", "--clip.pretrained=", "--push_to_hub=true", "--private=true",
-    ]  # fmt: skip
+        "lansar-convert",
+        f"--root={calvin.root}",
+        "--repo_id=me/desk",
+        f"--output_dir={out}",
+        "--embed=true",
+        "--clip.model=lansar-tiny",
+        "--clip.pretrained=",
+        "--push_to_hub=true",
+        "--private=true",
+    ]
 
     hub.fail_after = 3  # the line is cut in the middle
     code, printed = run(*arguments, home="home")
@@ -138,11 +145,19 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
 
     # another machine: an empty cache
     code, printed = run(
-        "lerobot-train", f"--config_path={REPOSITORY / 'configs/lansar.yaml'}", "--dataset.repo_id=me/desk",
-        "--steps=2", "--batch_size=4", "--save_freq=2", f"--output_dir={tmp_path / 'train'}",
-        "--policy.use_images=true", "--policy.clip.model=lansar-tiny", "--policy.clip.pretrained=",
-        "--policy.device=cpu", home="elsewhere",
-    )  # fmt: skip
+        "lerobot-train",
+        f"--config_path={REPOSITORY / 'configs/lansar.yaml'}",
+        "--dataset.repo_id=me/desk",
+        "--steps=2",
+        "--batch_size=4",
+        "--save_freq=2",
+        f"--output_dir={tmp_path / 'train'}",
+        "--policy.use_images=true",
+        "--policy.clip.model=lansar-tiny",
+        "--policy.clip.pretrained=",
+        "--policy.device=cpu",
+        home="elsewhere",
+    )
     assert code == 0, printed[-3000:]
     config = json.loads((tmp_path / "train/checkpoints/last/pretrained_model/config.json").read_text())
     assert config["type"] == "lansar"
@@ -156,9 +171,7 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
 
 def test_a_dataset_is_found_where_lerobot_reads_it(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
-    with pytest.raises(
-        FileNotFoundError, match=r"no dataset me/desk in .*, nor among .*/hub: .*--dataset_dir"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"no dataset me/desk in .*, nor among .*/hub: .*--dataset_dir"):
         find_dataset("me/desk", None)
     cache = tmp_path / "hub/datasets--me--desk"
     for folder in (cache / "refs", cache / "snapshots/0123", tmp_path / "me/desk/meta"):
@@ -167,17 +180,13 @@ def test_a_dataset_is_found_where_lerobot_reads_it(tmp_path, monkeypatch):
     assert find_dataset("me/desk", None) == cache / "snapshots/0123"
     (tmp_path / "me/desk/meta/info.json").touch()
     assert find_dataset("me/desk", None) == tmp_path / "me/desk"
-    (tmp_path / "me/desk/.cache/huggingface/download").mkdir(
-        parents=True
-    )  # by an earlier LeRobot, which it mistrusts
+    (tmp_path / "me/desk/.cache/huggingface/download").mkdir(parents=True)  # by an earlier LeRobot, which it mistrusts
     assert find_dataset("me/desk", None) == cache / "snapshots/0123"
     assert find_dataset("me/desk", tmp_path / "mine") == tmp_path / "mine"
 
 
 def test_the_card_tells_the_known_defects(tmp_path):
-    calvin = write_calvin(
-        tmp_path / "calvin", tasks=("lift_red_block_table", "lift_blue_block_table") * 3, length=5
-    )
+    calvin = write_calvin(tmp_path / "calvin", tasks=("lift_red_block_table", "lift_blue_block_table") * 3, length=5)
     index = calvin.root / "training/lang_annotations/auto_lang_ann.npy"
     annotations = np.load(index, allow_pickle=True).item()
     annotations["language"]["task"][0] = "lift_pink_block_table"  # the red one rises
@@ -186,9 +195,7 @@ def test_the_card_tells_the_known_defects(tmp_path):
     (calvin.root / "validation").mkdir()
     for frame in (103, 113):
         (calvin.root / "validation" / calvin.file(frame).name).touch()
-    out = convert.convert(
-        ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none", skip_bad=True)
-    )
+    out = convert.convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none", skip_bad=True))
     card = (out / "README.md").read_text()
     defects = card[card.index("### Known defects") : card.index("### Train and evaluate")]
     for part in (

@@ -9,10 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 from fake_calvin import write_calvin
 
-from dataset_convert.calvin import SCENES, TASKS
 from dataset_convert.convert import ConvertConfig, convert
 from dataset_convert.features import dataset_features, pictures_of
-from dataset_convert.writer import EpisodeStats, RGBEncoder
+from dataset_convert.layout import RGBEncoder
+from dataset_convert.stats import EpisodeStats
+from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 
 CAMERA_OF = {"observation.images.static": "rgb_static", "observation.images.gripper": "rgb_gripper"}
 
@@ -43,9 +44,14 @@ def both(request, tmp_path_factory):
     pictures = pictures_of(images, depth=False, tactile=False, encoder=RGBEncoder())
     features = {k: v for k, v in dataset_features("rel", pictures).items() if k not in DEFAULT_FEATURES}
     theirs = LeRobotDataset.create(
-        "me/desk", 30, features, folder / "theirs", "panda", use_videos=images == "video",
+        "me/desk",
+        30,
+        features,
+        folder / "theirs",
+        "panda",
+        use_videos=images == "video",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", crf=18, preset="veryfast"),
-    )  # fmt: skip
+    )
     for number, (start, end, task, sentence) in enumerate(source.windows):
         for frame in range(start, end):
             content = source.frames[frame]
@@ -59,8 +65,8 @@ def both(request, tmp_path_factory):
             numbers = {
                 "frame": frame,
                 "window": number,
-                "task": TASKS.index(task),
-                "scene": SCENES.index("D"),
+                "task": list(TASKS).index(task),
+                "scene": SCENE_NAMES.index("D"),
             }
             item |= {f"calvin.{name}": np.array([value]) for name, value in numbers.items()}
             if images != "none":
@@ -80,9 +86,7 @@ def test_every_item_is_equal(both):
             if key in CAMERA_OF:
                 picture = source.frames[a["calvin.frame"].item()][CAMERA_OF[key]]
                 wanted = picture.transpose(2, 0, 1) / 255
-                np.testing.assert_allclose(
-                    value, wanted, atol=0.03, err_msg="a frame of another time would be off"
-                )
+                np.testing.assert_allclose(value, wanted, atol=0.03, err_msg="a frame of another time would be off")
             elif isinstance(value, str):
                 assert value == b[key]
             else:
@@ -93,9 +97,7 @@ def test_every_item_is_equal(both):
 def test_pictures_are_described_as_they_lie():
     """Literally: a description that is made twice in the same wrong way would equal itself."""
     pictures = pictures_of("png", depth=True, tactile=True, encoder=RGBEncoder())
-    described = {
-        key: feature for key, feature in dataset_features("rel", pictures).items() if "images" in key
-    }
+    described = {key: feature for key, feature in dataset_features("rel", pictures).items() if "images" in key}
     assert {key.removeprefix("observation.images."): of["shape"] for key, of in described.items()} == {
         "static": (200, 200, 3),
         "gripper": (84, 84, 3),
@@ -168,9 +170,7 @@ def test_lerobots_tools_work_on_the_result(both, tmp_path):
 
     ours, _, source = both
     fewer = delete_episodes(ours, [0, 2], output_dir=tmp_path / "fewer", repo_id="me/fewer")
-    frames = [
-        frame for start, end, *_ in (source.windows[1], source.windows[3]) for frame in range(start, end)
-    ]
+    frames = [frame for start, end, *_ in (source.windows[1], source.windows[3]) for frame in range(start, end)]
     assert [item["calvin.frame"].item() for item in fewer] == frames
     kept = np.stack([source.frames[frame]["robot_obs"] for frame in frames])
     np.testing.assert_allclose(fewer.meta.stats["observation.state"]["mean"], kept.mean(axis=0), atol=1e-5)
@@ -187,9 +187,7 @@ def test_action_chunks_of_other_policies_stop_at_the_window_end(both):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     ours, _, _ = both
-    dataset = LeRobotDataset(
-        "me/desk", root=ours.root, delta_timestamps={"action": [i / 30 for i in range(4)]}
-    )
+    dataset = LeRobotDataset("me/desk", root=ours.root, delta_timestamps={"action": [i / 30 for i in range(4)]})
     assert dataset[8]["action_is_pad"].tolist() == [False, False, True, True]
     np.testing.assert_array_equal(dataset[8]["action"][1], ours[9]["action"])
 
@@ -213,12 +211,19 @@ def test_lerobot_doctor_finds_no_fault(both):
 def test_lerobot_dataset_viz_draws_an_episode(both, tmp_path):
     done = subprocess.run(
         [
-            sys.executable, "-m", "lerobot.scripts.lerobot_dataset_viz", "--repo-id=me/desk", f"--root={both[0].root}",
-            "--episode-index=1", "--num-workers=0", "--save=1", f"--output-dir={tmp_path}",
+            sys.executable,
+            "-m",
+            "lerobot.scripts.lerobot_dataset_viz",
+            "--repo-id=me/desk",
+            f"--root={both[0].root}",
+            "--episode-index=1",
+            "--num-workers=0",
+            "--save=1",
+            f"--output-dir={tmp_path}",
         ],
         capture_output=True,
         text=True,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     drawn = (tmp_path / "me_desk_episode_1.rrd").read_bytes()
     for key in ("action", "state", *set(both[0].meta.camera_keys)):

@@ -1,4 +1,4 @@
-"""``lansar-verify`` passes what the converter makes and finds whatever is changed in it afterwards."""
+"""`lansar-verify` passes what the converter makes and finds whatever is changed in it afterwards."""
 
 import json
 import shutil
@@ -222,7 +222,7 @@ DAMAGES = {
         lambda source, _: source.rewrite(112, rgb_static=source.frames[112]["rgb_static"] + 1),
         "frames of episode 1 changed since",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

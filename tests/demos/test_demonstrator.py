@@ -2,14 +2,16 @@
 
 import multiprocessing
 import os
+from functools import partial
 
 import numpy as np
 import pytest
 
-from lerobot_lansar.demos.demonstrator import MAX_STEPS, carry_out, demonstrate
-from lerobot_lansar.demos.motion import TOP_SPEED, Disturbance, relative_action
+from lerobot_lansar.calvin import STEPS_PER_COMMAND, TASKS, relative_action
+from lerobot_lansar.demos.demonstrator import carry_out, demonstrate
+from lerobot_lansar.demos.motion import TOP_SPEED, Disturbance
 from lerobot_lansar.demos.skills import SKILLS
-from lerobot_lansar.desk import SCENES, TASKS, Desk, DeskError, SimulationError
+from lerobot_lansar.desk import SCENES, Desk, DeskError, SimulationError, is_fulfilled
 from lerobot_lansar.desk.starts import sample_start
 
 STARTS, NEEDED = 30, 27
@@ -69,10 +71,8 @@ def demonstrations():
 
 def test_actions_stay_within_a_relative_step_and_imply_the_relative_ones(demonstrations):
     for demonstration in demonstrations:
-        assert 5 < len(demonstration) <= MAX_STEPS
-        rows = zip(
-            *(demonstration.frames[key] for key in ("actions", "rel_actions", "robot_obs")), strict=True
-        )
+        assert 5 < len(demonstration) <= STEPS_PER_COMMAND
+        rows = zip(*(demonstration.frames[key] for key in ("actions", "rel_actions", "robot_obs")), strict=True)
         for action, relative, robot_obs in rows:
             np.testing.assert_array_equal(relative, relative_action(action, robot_obs))
             assert np.abs(relative).max() <= 1
@@ -91,7 +91,7 @@ def test_replayed_actions_fulfil_the_task_again(demonstrations):
             start = desk.snapshot()
             for action in frames["actions"]:
                 desk.step(action, "abs")
-                if TASKS[demonstration.task](start, desk.snapshot()):
+                if is_fulfilled(demonstration.task, start, desk.snapshot()):
                     again += 1
                     break
     assert again >= 0.95 * len(demonstrations)
@@ -134,7 +134,7 @@ def test_recorded_states_reproduce_the_recorded_pictures(task):
 
 
 class Clumsy(Disturbance):
-    """Lets go for ten steps, once, ``when`` steps after the open hand was closed."""
+    """Lets go for ten steps, once, `when` steps after the open hand was closed."""
 
     def __init__(self, when):
         super().__init__(0.0, np.random.default_rng(0))
@@ -167,16 +167,21 @@ def test_a_drawer_that_slid_back_is_pulled_again():
         obs = desk.reset(*sample_start(desk, "open_drawer", rng))
         begun, pulled, back = desk.snapshot(), 0, False
         steps = carry_out(
-            desk, obs, SKILLS["open_drawer"], rng, variety=0.0, noise=0.0,
-            fulfilled=lambda now: TASKS["open_drawer"](begun, now),
-        )  # fmt: skip
+            desk,
+            obs,
+            SKILLS["open_drawer"],
+            rng,
+            variety=0.0,
+            noise=0.0,
+            fulfilled=lambda now: is_fulfilled("open_drawer", begun, now),
+        )
         for _, after, now in steps:
             if after["scene_obs"][1] > 0.08 and not back:
                 closed = after["scene_obs"].copy()
                 closed[1] = begun.drawer
                 desk.reset(after["robot_obs"], closed)
                 back = True
-            pulled = TASKS["open_drawer"](begun, now)
+            pulled = is_fulfilled("open_drawer", begun, now)
     assert back
     assert pulled
 
@@ -190,7 +195,7 @@ def test_demonstrations_end_as_soon_as_the_oracle_is_and_stays_satisfied(demonst
             for t in (0, len(demonstration) // 2, len(demonstration) - 1):
                 desk.reset(demonstration.frames["robot_obs"][t], demonstration.frames["scene_obs"][t])
                 snapshots.append(desk.snapshot())
-            fulfilled = TASKS[demonstration.task]
+            fulfilled = partial(is_fulfilled, demonstration.task)
             agreed += not fulfilled(snapshots[0], snapshots[1]) and fulfilled(snapshots[0], snapshots[2])
     assert agreed >= 0.9 * len(demonstrations)
 

@@ -11,12 +11,12 @@ import pytest
 import yaml
 
 import lerobot_lansar.demos.record as record_module
-from lerobot_lansar.demos.motion import relative_action
+from lerobot_lansar.calvin import relative_action
 from lerobot_lansar.demos.record import SPLITS, RecordConfig, place_of_unit, record
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, DeskError
-from lerobot_lansar.desk.commands import COMMANDS
-from lerobot_lansar.executors import SlurmConfig, WorkerDied
+from lerobot_lansar.desk.sentences import COMMANDS
+from lerobot_lansar.jobs.executors import SlurmConfig, WorkerDied
 
 
 def options(output_dir, **changes):
@@ -52,9 +52,7 @@ def test_folder_has_calvins_layout(recording):
         numbers = [int(file.stem.removeprefix("episode_")) for file in sorted(folder.glob("episode_*.npz"))]
         assert len(language["language"]["ann"]) == len(bounds) == episodes
         assert numbers == list(range(bounds[0, 0], bounds[-1, 1] + 1))
-        assert [end - 1 for _, end in language["info"]["indx"]] == bounds[
-            :, 1
-        ].tolist()  # windows end exclusive
+        assert [end - 1 for _, end in language["info"]["indx"]] == bounds[:, 1].tolist()  # windows end exclusive
         assert set(language["language"]["task"]) == {"turn_on_led", "lift_red_block_table"}
         assert np.load(folder / "scene_info.npy", allow_pickle=True).item() == {
             "calvin_scene_D": [numbers[0], numbers[-1]]
@@ -71,9 +69,7 @@ def test_folder_has_calvins_layout(recording):
 
 def test_rel_actions_follow_from_actions_and_robot_obs(recording):
     for frame in frames(recording / "training").values():
-        np.testing.assert_allclose(
-            frame["rel_actions"], relative_action(frame["actions"], frame["robot_obs"])
-        )
+        np.testing.assert_allclose(frame["rel_actions"], relative_action(frame["actions"], frame["robot_obs"]))
         assert np.abs(frame["rel_actions"]).max() <= 1
         moved = frame["rel_actions"][:3] * 0.02
         np.testing.assert_allclose(frame["robot_obs"][:3] + moved, frame["actions"][:3], atol=1e-9)
@@ -145,14 +141,16 @@ def test_demonstrations_on_the_original_desk_look_like_it(original_assets, tmp_p
 
 
 def test_blocks_go_to_disk_in_the_scenes_original_order(tmp_path):
-    folder = record(options(tmp_path / "desk", scene="A", tasks=["lift_red_block_table"], episodes=1,
-                            validation_episodes=1)) / "training"  # fmt: skip
+    folder = (
+        record(options(tmp_path / "desk", scene="A", tasks=["lift_red_block_table"], episodes=1, validation_episodes=1))
+        / "training"
+    )
     heights = np.array([frame["scene_obs"][[8, 14, 20]] for frame in frames(folder).values()])
     assert np.argmax(heights[-1] - heights[0]) == list(SCENES["A"].blocks).index("red") == 2
 
 
 def start(target, **popen):
-    """The command of ``options(target)``, with two workers, in a process of its own."""
+    """The command of `options(target)`, with two workers, in a process of its own."""
     flags = ["--seed=3", "--cameras=[]", "--tasks=[turn_on_led,lift_red_block_table]", "--episodes=4"]
     flags += ["--validation_episodes=2", "--workers=2", f"--output_dir={target}"]
     command = [sys.executable, "-m", "lerobot_lansar.demos.record", *flags]
@@ -232,9 +230,7 @@ def test_splits_speak_different_sentences(recording):
         language = np.load(annotations, allow_pickle=True).item()["language"]
         for task, sentence in zip(language["task"], language["ann"], strict=True):
             assert sentence in COMMANDS[split][task]
-    benchmark = np.load(
-        recording / "validation" / "lang_annotations" / "embeddings.npy", allow_pickle=True
-    ).item()
+    benchmark = np.load(recording / "validation" / "lang_annotations" / "embeddings.npy", allow_pickle=True).item()
     assert {task: entry["ann"] for task, entry in benchmark.items()} == {
         task: sentences[:1] for task, sentences in COMMANDS["validation"].items()
     }
@@ -316,20 +312,14 @@ def test_users_sentences_are_used(tmp_path):
     file = tmp_path / "own.yaml"
     file.write_text("turn_on_led: [light up]\n")
     folder = record(
-        options(
-            tmp_path / "desk", tasks=["turn_on_led"], episodes=1, validation_episodes=1, annotations=str(file)
-        )
+        options(tmp_path / "desk", tasks=["turn_on_led"], episodes=1, validation_episodes=1, annotations=str(file))
     )
-    language = np.load(
-        folder / "training" / "lang_annotations" / "auto_lang_ann.npy", allow_pickle=True
-    ).item()
+    language = np.load(folder / "training" / "lang_annotations" / "auto_lang_ann.npy", allow_pickle=True).item()
     assert language["language"]["ann"] == ["light up"]
 
 
 def test_scenes_share_a_recording_and_follow_each_other(tmp_path):
-    folder = (
-        record(options(tmp_path / "desk", scene=["A", "C"], tasks=["turn_on_led"], episodes=3)) / "training"
-    )
+    folder = record(options(tmp_path / "desk", scene=["A", "C"], tasks=["turn_on_led"], episodes=3)) / "training"
     scenes = np.load(folder / "scene_info.npy", allow_pickle=True).item()
     bounds = np.load(folder / "ep_start_end_ids.npy")
     assert scenes == {

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from lerobot_lansar.desk import SCENES, TASKS, Desk, DeskError
+from lerobot_lansar.calvin import TASKS
+from lerobot_lansar.desk import SCENES, Desk, DeskError
 from lerobot_lansar.desk.starts import sample_start
 
 ZERO = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -57,9 +58,7 @@ def test_the_evaluation_layout_of_scene_d_is_fixed():
                 obs = desk.step(ZERO)
             red, blue, pink = obs["scene_obs"][6:].reshape(3, 6)
             np.testing.assert_allclose(red[:2], [0.05, -0.12], atol=3e-3)
-            np.testing.assert_allclose(
-                blue[:3], [*red[:2], red[2] + 0.04], atol=4e-3
-            )  # it lies on the red one
+            np.testing.assert_allclose(blue[:3], [*red[:2], red[2] + 0.04], atol=4e-3)  # it lies on the red one
             np.testing.assert_allclose(pink[:2], [0.10, 0.08], atol=6e-3)  # the door pushes it a little
         assert desk.scene.name == "D"
 
@@ -122,9 +121,7 @@ def test_start_states_are_feasible_and_not_yet_fulfilled(desk, task):
     start = desk.snapshot()
     np.testing.assert_allclose(obs["robot_obs"][7:14], robot_obs[7:14], atol=0.02)
     assert task not in desk.completed_tasks(start)
-    assert (len(start.touched_by_robot) == 1) == (
-        task in ("place_in_slider", "place_in_drawer", "stack_block")
-    )
+    assert (len(start.touched_by_robot) == 1) == (task in ("place_in_slider", "place_in_drawer", "stack_block"))
     again = sample_start(desk, task, np.random.default_rng(11))
     np.testing.assert_array_equal(again[1], scene_obs)
 

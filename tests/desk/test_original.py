@@ -11,7 +11,8 @@ import pybullet as p
 import pytest
 from PIL import Image
 
-from lerobot_lansar.desk import COLORS, SCENES, TASKS, BlockState, Desk, DeskError, Snapshot, completed_tasks
+from lerobot_lansar.calvin import COLORS, TASKS
+from lerobot_lansar.desk import SCENES, BlockState, Desk, DeskError, Snapshot, completed_tasks
 
 EXCEPTION = "slider_A"
 """The one recording of 68 that is not repeated bit for bit: from its 173rd frame on, pushing the slide, joints differ
@@ -19,7 +20,7 @@ by up to 0.008 rad. What was simulated before the reset decides (without our cle
 what the original's fresh environment simulated at random before its first reset is not recorded."""
 
 TOLERANCE = 2
-"""Frames by which a task may be fulfilled earlier or later than in ``dynamics``, which was recorded without
+"""Frames by which a task may be fulfilled earlier or later than in `dynamics`, which was recorded without
 deterministic pairs: there the motion in contact depends on the environment's seed (surprise 1 of its README)."""
 
 OTHER_OUTCOMES = {

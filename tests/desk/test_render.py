@@ -75,9 +75,7 @@ def test_without_a_driver_egl_is_an_error_and_not_the_end():
         "except DeskError as error: print('said:', error)"
     )
     environment = {**os.environ, "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent", "EGL_PLATFORM": "nothing"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=environment
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=environment)
     assert done.returncode == 0
     if "said:" not in done.stdout:
         pytest.skip("this machine's EGL works whatever the environment says")
@@ -171,13 +169,19 @@ def test_a_triangle_that_reaches_behind_the_eye_is_cut_at_the_near_plane():
     ids = np.full((size, size), raster.NOTHING, np.int32)
     for order in (faces, faces[:, ::-1].copy()):
         raster.nearest(
-            order, 0, 2, screen, behind, (np.float32(0.1), np.float32(4.5)), np.float32(0), (0.0, 0.0, 0.0),
-            closeness, ids,
-        )  # fmt: skip
+            order,
+            0,
+            2,
+            screen,
+            behind,
+            (np.float32(0.1), np.float32(4.5)),
+            np.float32(0),
+            (0.0, 0.0, 0.0),
+            closeness,
+            ids,
+        )
     rows = np.arange(size) - 16
-    expected = np.where(
-        (rows < 0) & (rows <= -16 / 4.5), -rows / 16, 0
-    )  # 1 / distance of the floor, up to 4.5 m
+    expected = np.where((rows < 0) & (rows <= -16 / 4.5), -rows / 16, 0)  # 1 / distance of the floor, up to 4.5 m
     np.testing.assert_allclose(closeness, np.repeat(expected[:, None], size, 1), atol=1e-6)
 
 
@@ -206,7 +210,5 @@ def test_meshes_that_cannot_be_read_are_named(tmp_path):
 
 
 def test_unknown_renderers_are_refused():
-    with pytest.raises(
-        DeskError, match=r"renderer 'vulkan' is unknown; choose among fast, fast_gl, tiny, egl"
-    ):
+    with pytest.raises(DeskError, match=r"renderer 'vulkan' is unknown; choose among fast, fast_gl, tiny, egl"):
         Desk("D", renderer="vulkan")

@@ -4,8 +4,9 @@ import itertools
 
 import pytest
 
-from lerobot_lansar.desk import TASKS, DeskError
-from lerobot_lansar.desk.commands import COMMANDS, expand, load_commands
+from lerobot_lansar.calvin import TASKS
+from lerobot_lansar.desk import DeskError
+from lerobot_lansar.desk.sentences import COMMANDS, expand, load_commands
 
 
 def test_every_task_has_ten_training_sentences_and_others_held_out():

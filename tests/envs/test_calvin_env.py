@@ -9,18 +9,19 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import lerobot_lansar  # noqa: F401  (registers the environment)
+from lerobot_lansar.benchmark import load_chains
+from lerobot_lansar.calvin import TASKS
 from lerobot_lansar.demos.motion import Motion
 from lerobot_lansar.demos.moves import View
 from lerobot_lansar.demos.skills import SKILLS
-from lerobot_lansar.desk import TASKS, DeskError
+from lerobot_lansar.desk import DeskError
 from lerobot_lansar.envs import CalvinEnv
-from lerobot_lansar.envs.benchmark import load_chains
 
 NOTHING = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 
 def script(env, obs, tasks, seed=0):
-    """Carries out ``tasks`` one after the other with the demonstrator's skills; yields what each step returned."""
+    """Carries out `tasks` one after the other with the demonstrator's skills; yields what each step returned."""
     for task in tasks:
         state = obs["agent_pos"], obs["environment_state"][:24]
         view = View(env.unwrapped._desk.scene, *state, np.random.default_rng(seed))
@@ -51,9 +52,7 @@ def test_seed_chooses_the_chain_and_reset_without_seed_does_not_count_chains():
     env = CalvinEnv(cameras=())
     for seed, chain in ((0, 0), (1007, 7), (7, 7)):
         obs, _ = env.reset(seed=seed)
-        np.testing.assert_allclose(
-            obs["environment_state"][:2], load_chains()[chain].scene_obs[:2], atol=1e-3
-        )
+        np.testing.assert_allclose(obs["environment_state"][:2], load_chains()[chain].scene_obs[:2], atol=1e-3)
         assert env._commands == load_chains()[chain].tasks
     env.reset(seed=3)
     env.reset()

@@ -1,4 +1,4 @@
-"""``--env.type=calvin``: what LeRobot's evaluation gets to see."""
+"""`--env.type=calvin`: what LeRobot's evaluation gets to see."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
 import lerobot_policy_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.desk import DeskError
-from lerobot_lansar.desk.commands import COMMANDS
+from lerobot_lansar.desk.sentences import COMMANDS
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 
 

@@ -30,7 +30,7 @@ SMALL = {
 
 def small_config(**options):
     """A LanSARConfig small enough for tests, with lansar-tiny untrained."""
-    from lerobot_lansar.policy.clip import ClipConfig
+    from lerobot_lansar.clip.model import ClipConfig
     from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 
     return LanSARConfig(**{**SMALL, "clip": ClipConfig("lansar-tiny", ""), **options})
@@ -70,7 +70,7 @@ def make_dataset(
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_lansar.policy.windows import ACTION_NAMES
+    from lerobot_lansar.calvin import ACTION_NAMES
 
     def feature(size, names=None):
         return {"dtype": "float32", "shape": (size,), "names": names}
@@ -103,13 +103,13 @@ def make_dataset(
 
 def add_embeddings(root: Path, clip) -> np.ndarray:
     """Put made-up picture embeddings beside a dataset, as lansar-convert does; returns static's."""
-    from lerobot_lansar.policy.frames import CAMERAS, clip_dir, dataset_fingerprint
+    from lerobot_lansar.clip.store import IMAGE_FEATURES, clip_dir, dataset_fingerprint
 
     frames = json.loads((root / "meta" / "info.json").read_text())["total_frames"]
     clip_dir(root).mkdir()
     rng = np.random.default_rng(1)
-    arrays = {name: rng.normal(size=(frames, clip.embed_dim)).astype(np.float16) for name in CAMERAS}
-    for name, key in CAMERAS.items():
+    arrays = {name: rng.normal(size=(frames, clip.embed_dim)).astype(np.float16) for name in IMAGE_FEATURES}
+    for name, key in IMAGE_FEATURES.items():
         np.save(clip_dir(root) / f"{key}.npy", arrays[name])
     info = {
         "model": clip.config.model,

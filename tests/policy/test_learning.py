@@ -45,7 +45,7 @@ def teach(state, environment, colour):
 def record(root, episodes):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_lansar.policy.windows import ACTION_NAMES
+    from lerobot_lansar.calvin import ACTION_NAMES
 
     sizes = {"observation.state": 15, "observation.environment_state": 24, "action": 7}
     features = {k: {"dtype": "float32", "shape": (size,), "names": None} for k, size in sizes.items()}
@@ -59,9 +59,7 @@ def record(root, episodes):
             values = (state, environment, action)
             frame = {k: v.astype(np.float32) for k, v in zip(sizes, values, strict=True)}
             dataset.add_frame({**frame, "task": f"reach for the {COLOURS[i % 3]} block"})
-            action[:3] += rng.normal(
-                0, 0.004, 3
-            )  # what is done differs from what is recorded, as on the desk
+            action[:3] += rng.normal(0, 0.004, 3)  # what is done differs from what is recorded, as on the desk
             state = move(state, action)
         dataset.save_episode()
     dataset.finalize()
@@ -79,9 +77,7 @@ def train(policy, preprocess, tasks, updates, batch_size):
     losses = []
     for _ in range(updates):
         index = torch.randint(len(tasks), (batch_size,), generator=generator)
-        loss, _ = policy.forward(
-            preprocess({**empty, "index": index, "task": [tasks[int(i)] for i in index]})
-        )
+        loss, _ = policy.forward(preprocess({**empty, "index": index, "task": [tasks[int(i)] for i in index]}))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10)
         optimizer.step()
@@ -131,19 +127,24 @@ def test_the_recommended_preset_fits_32_demonstrations_and_repeats_them(tmp_path
     """400 updates on 32 recorded demonstrations of two tasks; then from the same starts on the desk."""
     from dataset_convert.convert import ConvertConfig, convert
     from lerobot_lansar.demos.record import RecordConfig, record
-    from lerobot_lansar.desk import TASKS, Desk
+    from lerobot_lansar.desk import Desk, is_fulfilled
     from lerobot_lansar.policy.configuration_lansar import LanSARConfig
     from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
     from lerobot_lansar.policy.processor_lansar import make_lansar_pre_post_processors
 
     folder = record(
-        RecordConfig(tmp_path / "desk", tasks=["turn_on_led", "close_drawer"], episodes=32, validation_episodes=1,
-                     cameras=[], variety=0.0, seed=5)
-    )  # fmt: skip
-    root = convert(
-        ConvertConfig(
-            root=folder, split="training", repo_id="test/desk", output_dir=tmp_path / "data", images="none"
+        RecordConfig(
+            tmp_path / "desk",
+            tasks=["turn_on_led", "close_drawer"],
+            episodes=32,
+            validation_episodes=1,
+            cameras=[],
+            variety=0.0,
+            seed=5,
         )
+    )
+    root = convert(
+        ConvertConfig(root=folder, split="training", repo_id="test/desk", output_dir=tmp_path / "data", images="none")
     )
     options = yaml.safe_load((CONFIGS / "lansar.yaml").read_text())["policy"]
     options.pop("type")
@@ -168,13 +169,11 @@ def test_the_recommended_preset_fits_32_demonstrations_and_repeats_them(tmp_path
             for _ in range(180):
                 seen = {
                     "observation.state": torch.tensor(obs["robot_obs"][None], dtype=torch.float32),
-                    "observation.environment_state": torch.tensor(
-                        obs["scene_obs"][None], dtype=torch.float32
-                    ),
+                    "observation.environment_state": torch.tensor(obs["scene_obs"][None], dtype=torch.float32),
                     "task": [episode["sentence"]],
                 }
                 obs = desk.step(policy.eval().select_action(preprocess(seen))[0].numpy(), "abs")
-                if TASKS[episode["task"]](begun, desk.snapshot()):
+                if is_fulfilled(episode["task"], begun, desk.snapshot()):
                     fulfilled += 1
                     break
     assert fulfilled >= 29

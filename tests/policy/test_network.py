@@ -177,9 +177,7 @@ def test_the_command_decides_which_block_a_single_context_layer_looks_at():
     inputs = windows(TINY, [1])
     for in_context in (False, True):
         network = build(command_in_context=in_context, context_layers=1).eval()
-        tokens = network.modalities(
-            *(inputs[name][0] for name in ("state", "blocks", "scene", "static", "gripper"))
-        )
+        tokens = network.modalities(*(inputs[name][0] for name in ("state", "blocks", "scene", "static", "gripper")))
         shares = []
         for command in torch.randn(2, 1, TINY.hidden):
             with recorded_attention(network.context_layers) as seen:

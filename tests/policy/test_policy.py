@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from lerobot_lansar.policy.clip import Clip, ClipConfig, embedding_size
+from lerobot_lansar.clip.model import Clip, ClipConfig, embedding_size
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.processor_lansar import ClipStep, make_lansar_pre_post_processors
@@ -71,9 +71,7 @@ def test_the_loss_is_eq_4_6_on_scaled_targets_over_valid_steps(relative):
 
     rows = batch["valid_steps"]
     assert rows.tolist() == [*range(20), *range(64, 128), *range(128, 132)]
-    x, blocks, scene = policy.scaler.encode(
-        batch["observation.state"], batch["observation.environment_state"]
-    )
+    x, blocks, scene = policy.scaler.encode(batch["observation.state"], batch["observation.environment_state"])
     motion, logit, _ = policy.network(batch["observation.clip.command"], x, blocks, scene, rows)
     goal = batch["action"].reshape(-1, 7)[rows]
     true = (goal[:, :6] - policy.scaler.delta_mean) / policy.scaler.delta_std
@@ -170,9 +168,7 @@ def test_cached_steps_give_what_the_whole_window_at_once_gives(slide, options, m
     expected = [windows_of(row, 120, 64, slide) for row in tasks]
     seen, predictions = [], []
     predict = policy.network.predict
-    monkeypatch.setattr(
-        policy.network, "predict", lambda x: predictions.append(predict(x)) or predictions[-1]
-    )
+    monkeypatch.setattr(policy.network, "predict", lambda x: predictions.append(predict(x)) or predictions[-1])
     for t in range(200):
         batch = preprocess({**observation(rng, 3), "task": [row[t] for row in tasks]})
         seen.append(batch)
@@ -184,9 +180,7 @@ def test_cached_steps_give_what_the_whole_window_at_once_gives(slide, options, m
             state = torch.stack([b["observation.state"][i] for b in steps])[None]
             environment = torch.stack([b["observation.environment_state"][i] for b in steps])[None]
             command = batch["observation.clip.command"][i : i + 1]
-            whole, *_ = policy.network(
-                command, *policy.scaler.encode(state, environment), torch.arange(len(steps))
-            )
+            whole, *_ = policy.network(command, *policy.scaler.encode(state, environment), torch.arange(len(steps)))
             torch.testing.assert_close(cached[i], whole[-1], atol=1e-5, rtol=0)
 
 
@@ -205,9 +199,7 @@ def test_a_history_is_cleared_for_the_row_whose_command_changes_and_after_the_se
     assert [len(history.contexts) for history in policy._histories] == [1, 1]
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"mlp_norm": "layer", "command_in_context": False}, {"use_images": True}]
-)
+@pytest.mark.parametrize("options", [{}, {"mlp_norm": "layer", "command_in_context": False}, {"use_images": True}])
 def test_an_action_does_not_depend_on_its_neighbours(options):
     config = small_config(window=4, **options)
     torch.manual_seed(0)
@@ -217,8 +209,7 @@ def test_an_action_does_not_depend_on_its_neighbours(options):
     tasks = [["open the drawer"] * 3 if t < 3 else ["open the drawer", "lift", "drop it"] for t in range(6)]
     observations = [observation(rng, 3, pictures=config.use_images) for _ in tasks]
     together = [
-        policy.select_action(preprocess({**o, "task": list(task)}))
-        for o, task in zip(observations, tasks, strict=True)
+        policy.select_action(preprocess({**o, "task": list(task)})) for o, task in zip(observations, tasks, strict=True)
     ]
     for row in range(3):
         policy.reset()
@@ -264,9 +255,7 @@ def test_missing_features_are_named():
     config = small_config()
     config.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (6,))}
     config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
-    with pytest.raises(
-        ValueError, match=r"shape \(6,\), not \(15,\); observation.environment_state is missing"
-    ):
+    with pytest.raises(ValueError, match=r"shape \(6,\), not \(15,\); observation.environment_state is missing"):
         LanSARPolicy(config)
 
 
@@ -321,9 +310,7 @@ def test_embeddings_made_with_other_clip_weights_are_refused(tmp_path):
     add_embeddings(root, clip)
     policy = LanSARPolicy(small_config(use_images=True), dataset_meta=dataset_meta(root))
     preprocess, _ = make_lansar_pre_post_processors_for(policy)
-    with pytest.raises(
-        ValueError, match=r"pictures were embedded with other weights.*--policy.clip.pretrained"
-    ):
+    with pytest.raises(ValueError, match=r"pictures were embedded with other weights.*--policy.clip.pretrained"):
         preprocess(sampled_frames(0))
     with pytest.raises(ValueError, match=r"policy was trained with other weights"):
         ClipStep("lansar-tiny", "", weights_sha256="e" * 64).clip("cpu")
@@ -410,17 +397,19 @@ def test_mixed_precision_changes_neither_what_is_kept_nor_what_is_decided():
     assert torch.equal(action, expected)
     clip = Clip(ClipConfig("lansar-tiny", ""), "cpu")
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert torch.equal(
-            clip.encode_texts(["go"]), Clip(ClipConfig("lansar-tiny", ""), "cpu").encode_texts(["go"])
-        )
+        assert torch.equal(clip.encode_texts(["go"]), Clip(ClipConfig("lansar-tiny", ""), "cpu").encode_texts(["go"]))
 
 
 def test_options_of_training_change_training_only(tmp_path):
     make_dataset(tmp_path / "data", "rel", shown=tuple(enumerate(COMMANDS)))
     config = small_config(
-        dropout=0.0, mlp_norm="layer", state_noise=0.01, contrastive_weight=0.5, paraphrases=True,
+        dropout=0.0,
+        mlp_norm="layer",
+        state_noise=0.01,
+        contrastive_weight=0.5,
+        paraphrases=True,
         egocentric_blocks=True,
-    )  # fmt: skip
+    )
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(tmp_path / "data"))
     preprocess, _ = make_lansar_pre_post_processors_for(policy)
     batch = preprocess(sampled_frames(0, 25, 115))

@@ -85,19 +85,13 @@ def test_lerobot_train_trains_resumes_fine_tunes_and_measures_a_held_out_loss(tm
         kept = load_file(tuned / "model.safetensors")[f"scaler.{name}"]
         assert torch.equal(kept, first[f"scaler.{name}"])  # the checkpoint's, not those of the new dataset
         assert "std" in name or not torch.equal(kept, value)
-    steps = [
-        s["registry_name"] for s in json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
-    ]
+    steps = [s["registry_name"] for s in json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]]
     assert {"rename_observations_processor", "device_processor", "normalizer_processor"} < set(steps)
     assert str(tmp_path) not in (checkpoint / "policy_preprocessor.json").read_text()
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("target", "achieved"), ("mlp_norm", "layer"), ("context_heads", 1)]
-)
-def test_what_a_checkpoints_weights_are_made_for_cannot_be_changed_under_them(
-    name, value, tmp_path, relative
-):
+@pytest.mark.parametrize(("name", "value"), [("target", "achieved"), ("mlp_norm", "layer"), ("context_heads", 1)])
+def test_what_a_checkpoints_weights_are_made_for_cannot_be_changed_under_them(name, value, tmp_path, relative):
     root, _ = relative
     LanSARPolicy(small_config()).save_pretrained(tmp_path)
     config = small_config(**{name: value})
@@ -110,10 +104,21 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
     """`accelerate launch` on two processes, without a GPU on the CPU (gloo), each with a batch of its own."""
     make_dataset(tmp_path / "data", "rel")
     policy = [f"--policy.{key}={json.dumps(value)}" for key, value in SMALL.items()]
-    first = ["--policy.type=lansar", *policy, "--policy.clip.model=lansar-tiny", "--policy.clip.pretrained=",
-             "--policy.dtype=bfloat16", "--dataset.repo_id=test/desk",
-             f"--dataset.root={tmp_path / 'data'}", f"--output_dir={tmp_path / 'out'}", "--batch_size=4", "--steps=4",
-             "--save_freq=2", "--num_workers=0", "--log_freq=1"]  # fmt: skip
+    first = [
+        "--policy.type=lansar",
+        *policy,
+        "--policy.clip.model=lansar-tiny",
+        "--policy.clip.pretrained=",
+        "--policy.dtype=bfloat16",
+        "--dataset.repo_id=test/desk",
+        f"--dataset.root={tmp_path / 'data'}",
+        f"--output_dir={tmp_path / 'out'}",
+        "--batch_size=4",
+        "--steps=4",
+        "--save_freq=2",
+        "--num_workers=0",
+        "--log_freq=1",
+    ]
     config = tmp_path / "out/checkpoints/last/pretrained_model/train_config.json"
     launcher = [sys.executable, "-m", "accelerate.commands.launch", "--multi_gpu", "--num_processes=2"]
     environment = {
@@ -125,8 +130,12 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
     for arguments in (first, [f"--config_path={config}", "--resume=true", "--steps=6"]):
         done = subprocess.run(
             [*launcher, "-m", "lerobot.scripts.lerobot_train", *arguments],
-            env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600,
-        )  # fmt: skip
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
         assert done.returncode == 0, done.stderr[-3000:]
         assert "effective batch size: 8" in done.stderr + done.stdout
 
@@ -176,26 +185,47 @@ def test_shipped_configurations_hold_real_options_only(name):
 def test_the_thesis_preset_is_the_thesis():
     written = yaml.safe_load((CONFIGS / "thesis/baseline.yaml").read_text())["policy"]
     assert written == {
-        "type": "lansar", "push_to_hub": False,
+        "type": "lansar",
+        "push_to_hub": False,
         # Table 4.2, but for 8 decoder heads
-        "hidden": 512, "context_layers": 6, "context_heads": 16, "decoder_layers": 6, "decoder_heads": 8,
-        "feedforward": 2048, "dropout": 0.1, "window": 64, "learning_rate": 4e-4, "weight_decay": 0.01,
+        "hidden": 512,
+        "context_layers": 6,
+        "context_heads": 16,
+        "decoder_layers": 6,
+        "decoder_heads": 8,
+        "feedforward": 2048,
+        "dropout": 0.1,
+        "window": 64,
+        "learning_rate": 4e-4,
+        "weight_decay": 0.01,
         "warmup_fraction": 5 / 125,
         # sections 3 and 4.2
-        "mlp_norm": "batch", "use_images": True, "use_spatial_context": True, "command_prepended": False,
-        "orientation": "euler", "target": "achieved", "window_start": "episode", "smooth_l1_beta": 0.1,
+        "mlp_norm": "batch",
+        "use_images": True,
+        "use_spatial_context": True,
+        "command_prepended": False,
+        "orientation": "euler",
+        "target": "achieved",
+        "window_start": "episode",
+        "smooth_l1_beta": 0.1,
         # section 4.3.1
-        "control_mode": "abs", "history_clear_steps": 120, "window_slide": 1,
-        "position_scale_start": 3.0, "position_scale_slope": 1.0, "yaw_scale": 1.5,
+        "control_mode": "abs",
+        "history_clear_steps": 120,
+        "window_slide": 1,
+        "position_scale_start": 3.0,
+        "position_scale_slope": 1.0,
+        "yaw_scale": 1.5,
         "clip": {"model": "ViT-B-32", "pretrained": "openai"},
         # what the thesis does not have
-        "command_in_context": False, "egocentric_blocks": False, "paraphrases": False, "state_noise": 0.0,
-        "contrastive_weight": 0.0, "dtype": "float32",
-    }  # fmt: skip
-    config, rest = training_config("thesis/baseline")
-    options = {option.name for option in fields(config)} - {
-        option.name for option in fields(PreTrainedConfig)
+        "command_in_context": False,
+        "egocentric_blocks": False,
+        "paraphrases": False,
+        "state_noise": 0.0,
+        "contrastive_weight": 0.0,
+        "dtype": "float32",
     }
+    config, rest = training_config("thesis/baseline")
+    options = {option.name for option in fields(config)} - {option.name for option in fields(PreTrainedConfig)}
     assert options - {"normalization_mapping"} <= written.keys()  # a new option must be decided here too
     assert round(config.warmup_fraction * rest["steps"]) == 1200
     assert rest["batch_size"] * rest["steps"] == 125 * 240 * 96
@@ -223,9 +253,13 @@ def test_the_thesis_experiments_differ_from_its_baseline_in_what_they_say(name, 
 
 @pytest.mark.parametrize(
     ("name", "perturbation"),
-    [("eval", (0, 0)), ("eval_perturbed_5_50", (50, 5)), ("eval_perturbed_2.5_25", (25, 2.5)),
-     ("eval_perturbed_0.5_5", (5, 0.5))],
-)  # fmt: skip
+    [
+        ("eval", (0, 0)),
+        ("eval_perturbed_5_50", (50, 5)),
+        ("eval_perturbed_2.5_25", (25, 2.5)),
+        ("eval_perturbed_0.5_5", (5, 0.5)),
+    ],
+)
 def test_the_thesis_evaluations_are_its_protocol(name, perturbation):
     from lerobot.configs.eval import EvalPipelineConfig
 

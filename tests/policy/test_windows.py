@@ -10,10 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from lerobot_lansar.calvin import wrap_angle
+from lerobot_lansar.clip.model import Clip, ClipConfig
+from lerobot_lansar.clip.store import dataset_fingerprint
 from lerobot_lansar.policy import frames as frames_module
-from lerobot_lansar.policy.clip import Clip, ClipConfig
-from lerobot_lansar.policy.frames import CACHE, dataset_fingerprint, load_frames
-from lerobot_lansar.policy.scaling import INPUT_FLOOR, Scaler, wrap
+from lerobot_lansar.policy.frames import CACHE, load_frames
+from lerobot_lansar.policy.scaling import INPUT_FLOOR, Scaler
 from lerobot_lansar.policy.windows import Windows, action_form
 
 from .conftest import LENGTHS, add_embeddings, dataset_meta, make_dataset, small_config
@@ -49,9 +51,7 @@ def reference_target(episode, form, target, t):
     return [*delta, 1.0 if action[t, 6] > 0 else 0.0]
 
 
-@pytest.mark.parametrize(
-    ("form", "target"), [("rel", "commanded"), ("abs", "commanded"), ("rel", "achieved")]
-)
+@pytest.mark.parametrize(("form", "target"), [("rel", "commanded"), ("abs", "commanded"), ("rel", "achieved")])
 def test_a_batch_of_windows_is_what_a_plain_loop_gives(form, target, relative, absolute):
     root, episodes = relative if form == "rel" else absolute
     windows = make_windows(root, target=target, window_start="anywhere")
@@ -100,12 +100,8 @@ def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path, monkeypatch):
 
 
 def test_relative_and_absolute_actions_teach_the_same(relative, absolute):
-    np.testing.assert_allclose(
-        make_windows(relative[0]).targets, make_windows(absolute[0]).targets, atol=2e-6
-    )
-    assert (
-        np.abs(make_windows(absolute[0]).targets[:, 3:6]).max() < 0.05
-    )  # the roll crosses pi, its change does not
+    np.testing.assert_allclose(make_windows(relative[0]).targets, make_windows(absolute[0]).targets, atol=2e-6)
+    assert np.abs(make_windows(absolute[0]).targets[:, 3:6]).max() < 0.05  # the roll crosses pi, its change does not
 
 
 def test_windows_of_a_demonstration_start_where_the_rule_says(relative):
@@ -181,9 +177,7 @@ def test_uninterrupted_play_is_refused(tmp_path):
     make_dataset(tmp_path / "data", lengths=(6, 9))
     (path,) = frames_module.data_files(tmp_path / "data")
     table = pq.read_table(path)
-    task = np.append(
-        table["task_index"].to_numpy()[:-1], 0
-    )  # the last frame is of the first episode's command
+    task = np.append(table["task_index"].to_numpy()[:-1], 0)  # the last frame is of the first episode's command
     column = table.schema.get_field_index("task_index")
     pq.write_table(table.set_column(column, "task_index", pa.array(task)), path)
     with pytest.raises(ValueError, match=r"within episode 1 \(index 14\).*--mode=windows"):
@@ -237,9 +231,7 @@ def test_scaled_inputs_have_mean_0_and_sigma_1_and_binary_values_stay(relative):
         torch.testing.assert_close(scene[:, 4:], environment[:, 4:6], rtol=0, atol=0)
         assert scene[:, 2].abs().max() < 1e-4 / INPUT_FLOOR
         delta = torch.tensor(windows.targets[:, :6])
-        torch.testing.assert_close(
-            scaler.unscale_delta(scaler.scale_delta(delta)), delta, atol=1e-6, rtol=1e-5
-        )
+        torch.testing.assert_close(scaler.unscale_delta(scaler.scale_delta(delta)), delta, atol=1e-6, rtol=1e-5)
 
 
 def test_sine_and_cosine_do_not_jump_where_euler_angles_do():
@@ -257,8 +249,8 @@ def test_sine_and_cosine_do_not_jump_where_euler_angles_do():
 def test_wrapping_goes_to_minus_pi_exclusive_pi_inclusive():
     angles = torch.tensor([0.0, 3.5, -3.5, 7.0], dtype=torch.float64)
     expected = torch.tensor([0.0, 3.5 - 2 * math.pi, 2 * math.pi - 3.5, 7 - 2 * math.pi], dtype=torch.float64)
-    torch.testing.assert_close(wrap(angles), expected)
-    assert wrap(torch.tensor(-math.pi, dtype=torch.float64)) == math.pi
+    torch.testing.assert_close(wrap_angle(angles), expected)
+    assert wrap_angle(torch.tensor(math.pi, dtype=torch.float64)) == -math.pi
 
 
 def test_paraphrases_say_the_same_task_in_other_words(tmp_path):

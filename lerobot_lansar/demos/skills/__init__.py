@@ -4,7 +4,7 @@ A skill goes on until the demonstrator stops it because the oracle is satisfied,
 Distances come from the desk's measured geometry: handle and lever sizes, button height, block sizes.
 """
 
-from ...desk import COLORS
+from ...calvin import COLORS
 from ..moves import Skill
 from . import blocks, furniture
 
@@ -18,9 +18,7 @@ SKILLS: dict[str, Skill] = {
     "open_drawer": furniture.open_drawer,
     "close_drawer": furniture.close_drawer,
     **{
-        f"lift_{color}_block_{place}": blocks.lift(color)
-        for color in COLORS
-        for place in ("table", "slider", "drawer")
+        f"lift_{color}_block_{place}": blocks.lift(color) for color in COLORS for place in ("table", "slider", "drawer")
     },
     "place_in_slider": blocks.place_in_slider,
     "place_in_drawer": blocks.place_in_drawer,

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from ...desk import COLORS
+from ...calvin import COLORS
 from ...desk.scenes import BLOCK_SIDE
 from ...desk.starts import DOOR_WIDTH, DRAWER_Z, TABLE_Z
 from ..moves import (
@@ -90,7 +90,7 @@ def _draw_in(view: View, color: str) -> Iterator[Waypoint]:
 
 
 def _take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
-    """Brings the open hand around a block and closes it; ``turn`` (rad) is how far the wrist must turn afterwards."""
+    """Brings the open hand around a block and closes it; `turn` (rad) is how far the wrist must turn afterwards."""
     if in_cabinet(view.block(color)):
         yield from _draw_in(view, color)
     yaws = grasp_yaws(view, color)
@@ -156,7 +156,7 @@ def _top_of_stack(view: View) -> str | None:
 def _set_down(
     view: View, color: str, way: list[tuple[np.ndarray, float, float]], euler: np.ndarray
 ) -> Iterator[Waypoint]:
-    """Carries the block in the hand along ``way`` (position, slow, tolerance), lets go at its end and draws back."""
+    """Carries the block in the hand along `way` (position, slow, tolerance), lets go at its end and draws back."""
     keep = partial(view.holds, color)
     yield from travel(view, way[0][0], CLOSED, euler, keep)
     for position, slow, tolerance in way:
@@ -167,7 +167,7 @@ def _set_down(
 
 
 def _from_above(view: View, color: str, place: np.ndarray, yaw: float, over: float) -> Iterator[Waypoint]:
-    """Sets the block in the hand down at ``place``, which the hand reaches straight from height ``over``."""
+    """Sets the block in the hand down at `place`, which the hand reaches straight from height `over`."""
     above = np.array([place[0], place[1], over])
     return _set_down(view, color, [(above, 0.9, 0.008), (place, 0.7, 0.008)], pointing(yaw, *stretch(place)))
 
@@ -218,7 +218,7 @@ def place_in_slider(view: View, color: str) -> Iterator[Waypoint]:
 
 
 def open_part(view: View, x: float | None = None) -> tuple[float, float]:
-    """x range (m) of the cabinet that the door leaves open: the side on which ``x`` is, or else the wider one."""
+    """x range (m) of the cabinet that the door leaves open: the side on which `x` is, or else the wider one."""
     left, right = view.scene.cabinet
     door = view.scene.slide_x - view.scene_obs[0]
     sides = ((left, door), (door + DOOR_WIDTH, right))
@@ -229,9 +229,7 @@ def open_part(view: View, x: float | None = None) -> tuple[float, float]:
 
 def _freest(view: View, color: str, places: list[np.ndarray]) -> np.ndarray:
     """The first place with room for a block and a hand, or the one farthest from the other blocks."""
-    rooms = [
-        min(float(np.linalg.norm(other[:2] - place[:2])) for other in view.others(color)) for place in places
-    ]
+    rooms = [min(float(np.linalg.norm(other[:2] - place[:2])) for other in view.others(color)) for place in places]
     for place, room in zip(places, rooms, strict=True):
         if room > 0.11:
             return place
@@ -319,7 +317,7 @@ def _half_width(view: View, color: str, direction: np.ndarray) -> float:
 
 
 def _shove(view: View, color: str, direction: np.ndarray, distance: float) -> Iterator[Waypoint]:
-    """Sets the closed hand down beside a block and pushes it along ``direction`` (2,)."""
+    """Sets the closed hand down beside a block and pushes it along `direction` (2,)."""
     block = view.block(color)
     behind = _half_width(view, color, direction) + 0.03 + abs(view.scatter(0.01))
     side = np.array([-direction[1], direction[0]]) * view.scatter(0.004)
@@ -335,7 +333,7 @@ def _shove(view: View, color: str, direction: np.ndarray, distance: float) -> It
 
 
 def _carry(view: View, color: str, place: np.ndarray) -> Iterator[Waypoint]:
-    """Takes a block, carries it low over the table to ``place`` (2,) and sets it down."""
+    """Takes a block, carries it low over the table to `place` (2,) and sets it down."""
     if not view.holds(color):
         yield from _take(view, color)
     if not view.holds(color):
@@ -367,24 +365,18 @@ def push(color: str, direction: float) -> Skill:
                 yield from _shove(view, color, np.array([direction, 0.0]), max(missing, 0.03))
             else:
                 yield from retreat(view, OPEN)
-                yield from _carry(
-                    view, color, _landing(view, color, begin + direction * np.arange(0.125, 0.34, 0.015))
-                )
+                yield from _carry(view, color, _landing(view, color, begin + direction * np.arange(0.125, 0.34, 0.015)))
 
     return skill
 
 
 def _way_is_free(view: View, color: str, pose: np.ndarray, end: float) -> bool:
-    """Whether a block can be pushed along x to ``end``, and a hand fits behind it."""
+    """Whether a block can be pushed along x to `end`, and a hand fits behind it."""
     half = _half_width(view, color, np.array([0.0, 1.0]))
     width = _half_width(view, color, np.array([1.0, 0.0]))
     direction = np.sign(end - pose[0])
     low, high = sorted((pose[0] - direction * (width + 0.06), end + direction * width))
-    if (
-        abs(pose[1] + 0.12) < half + 0.045
-        and low < view.scene.button_x + 0.042
-        and high > view.scene.button_x - 0.042
-    ):
+    if abs(pose[1] + 0.12) < half + 0.045 and low < view.scene.button_x + 0.042 and high > view.scene.button_x - 0.042:
         return False
     for name in COLORS:
         other = view.block(name)
@@ -397,7 +389,7 @@ def _way_is_free(view: View, color: str, pose: np.ndarray, end: float) -> bool:
 
 
 def _landing(view: View, color: str, xs: np.ndarray) -> np.ndarray:
-    """A free place (2,) on the table with x among ``xs``, as near to the block as can be."""
+    """A free place (2,) on the table with x among `xs`, as near to the block as can be."""
     pose, radius = view.block(color), view.length(color) / 2
     best, least = np.array([xs[0], pose[1]]), np.inf
     for x in xs[np.abs(xs) <= EDGE]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ...desk.scenes import BUTTON_TRAVEL
+from ...desk.scenes import BUTTON_TRAVEL, BUTTON_Y
 from ..moves import CLOSED, FORWARD, TRIES, Skill, View, Waypoint, travel
 
 HANDLE_Z = 0.365
@@ -36,7 +36,7 @@ def close_drawer(view: View) -> Iterator[Waypoint]:
 def press_button(view: View) -> Iterator[Waypoint]:
     """Press the LED's button from above; let go and press again if the light did not change."""
     for _ in range(TRIES):
-        x, y = view.scene.button_x + view.scatter(0.012), -0.12 + view.scatter(0.012)
+        x, y = view.scene.button_x + view.scatter(0.012), BUTTON_Y + view.scatter(0.012)
         yield from travel(view, (x, y, 0.56), view.style.idle_gripper)
         yield view.go((x, y, 0.54 + view.scatter(0.015)), tolerance=0.015)
         yield view.go((x, y, 0.483 - BUTTON_TRAVEL), slow=0.7, tolerance=0.006)

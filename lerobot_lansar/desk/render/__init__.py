@@ -1,6 +1,6 @@
 """Pictures of a desk, by four renderers behind one switch.
 
-``fast`` and ``fast_gl`` are ours (numba, no driver) in the two looks that PyBullet has; ``tiny`` and ``egl`` are
+`fast` and `fast_gl` are ours (numba, no driver) in the two looks that PyBullet has; `tiny` and `egl` are
 PyBullet's own and the reference for them.
 """
 
@@ -24,14 +24,14 @@ class Renderer(Protocol):
     def draw(
         self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`.fast.FastRenderer.draw`."""
+        """As `fast.FastRenderer.draw`."""
 
 
 class Preparation:
     """What a renderer needs to be done before anybody asks for a picture.
 
     Args:
-        name: One of :data:`RENDERERS`.
+        name: One of `RENDERERS`.
         client: Bullet client, still empty: the EGL plugin draws only what is loaded after it.
     """
 
@@ -42,14 +42,14 @@ class Preparation:
         self._visuals: list[Visual] | None = None
 
     def loaded(self, temporary: bool) -> None:
-        """To be called when all bodies are loaded; reads their shapes now if the files are ``temporary``."""
+        """To be called when all bodies are loaded; reads their shapes now if the files are `temporary`."""
         if temporary and self._name.startswith("fast"):
             from .visuals import read_visuals
 
             self._visuals = read_visuals(self._client, self._round_boxes)
 
     def open(self, repainted: Collection[tuple[int, int]]) -> Renderer:
-        """The renderer; ``repainted`` names the (body, link) whose colours change.
+        """The renderer; `repainted` names the (body, link) whose colours change.
 
         Raises:
             DeskError: A mesh cannot be read, or pybullet lacks numpy.

@@ -17,11 +17,11 @@ Colors = dict[tuple[int, int], tuple[float, ...]]
 
 
 class BulletRenderer:
-    """Draws with ``getCameraImage``.
+    """Draws with `getCameraImage`.
 
     Args:
         client: Bullet client.
-        plugin: The EGL plugin's id in this client (:func:`load_egl`), or None for TinyRenderer.
+        plugin: The EGL plugin's id in this client (`load_egl`), or None for TinyRenderer.
 
     Raises:
         DeskError: This pybullet was built without numpy.
@@ -45,7 +45,7 @@ class BulletRenderer:
     def draw(
         self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`.fast.FastRenderer.draw`."""
+        """As `fast.FastRenderer.draw`."""
         for (body, link), color in colors.items():
             if self._shown.get((body, link)) != color:
                 p.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
@@ -67,9 +67,7 @@ class BulletRenderer:
 @cache
 def _egl_works(plugin: str) -> bool:
     """Tried in another process: without a driver the plugin ends the one that loads it."""
-    code = (
-        "import pybullet as p, sys; p.connect(p.DIRECT); sys.exit(p.loadPlugin(sys.argv[1], sys.argv[2]) < 0)"
-    )
+    code = "import pybullet as p, sys; p.connect(p.DIRECT); sys.exit(p.loadPlugin(sys.argv[1], sys.argv[2]) < 0)"
     command = [sys.executable, "-c", code, plugin, _PLUGIN]
     return subprocess.run(command, capture_output=True, timeout=60).returncode == 0
 

@@ -62,7 +62,7 @@ class FastRenderer:
             camera: Field of view and clip planes.
             view: (4, 4) world to eye.
             size: Pixels per side.
-            colors: rgba of (body, link) that were repainted.
+            colors: Rgba of (body, link) that were repainted.
             keep: The camera stands still: remember what never moves.
 
         Returns:
@@ -104,7 +104,7 @@ class FastRenderer:
         return layer, [i for i in self._moving if i not in groups]
 
     def _rule(self, camera: Camera, group: int) -> tuple[float, float, float]:
-        """What :func:`.raster.nearest` calls close; 1 / w by default."""
+        """What `raster.nearest` calls close; 1 / w by default."""
         return 0.0, 0.0, 0.0
 
     def _inverse(self, closeness: np.ndarray, camera: Camera) -> np.ndarray:
@@ -112,11 +112,11 @@ class FastRenderer:
         return closeness
 
     def _blank(self, size: int) -> np.ndarray:
-        """An empty canvas: whatever :meth:`_shade` fills."""
+        """An empty canvas: whatever `_shade` fills."""
         raise NotImplementedError
 
     def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
-        """Fills the canvas where ``ids`` names a face."""
+        """Fills the canvas where `ids` names a face."""
         raise NotImplementedError
 
     def _finish(self, canvas: np.ndarray, closeness: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -150,9 +150,17 @@ class FastRenderer:
             behind = raster.project(self._vertices[:, part.vertices], matrix, self._screen[part.vertices])
             first, last = part.faces.start, part.faces.stop
             raster.nearest(
-                self._faces, first, last, self._screen, behind, limits, self.smallest, self._rule(camera, index),
-                closeness, ids,
-            )  # fmt: skip
+                self._faces,
+                first,
+                last,
+                self._screen,
+                behind,
+                limits,
+                self.smallest,
+                self._rule(camera, index),
+                closeness,
+                ids,
+            )
         tints = self._own_colors
         if colors:
             tints = tints.copy()
@@ -164,7 +172,7 @@ class FastRenderer:
 
 @dataclass
 class _Layer:
-    """Part of a picture: ``groups`` are painted on it, besides what never moves.
+    """Part of a picture: `groups` are painted on it, besides what never moves.
 
     Attributes:
         poses, colors: As they were when the camera last took a picture.

@@ -1,4 +1,4 @@
-"""``renderer="fast_gl"``: the pictures that Bullet's OpenGL renderer draws, CALVIN's public data among them."""
+"""`renderer="fast_gl"`: the pictures that Bullet's OpenGL renderer draws, CALVIN's public data among them."""
 
 import numpy as np
 from PIL import Image
@@ -61,9 +61,24 @@ class OpenGLLook(FastRenderer):
 
     def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
         raster.light_gl(
-            ids, self._faces, self._screen, self._owner, self._normals, self._uvs, self._places, self._levels,
-            self._texels, colors, poses, self._groups, self._vertices, LIGHT, HIGHLIGHT_EYE, self._shadow, canvas,
-        )  # fmt: skip
+            ids,
+            self._faces,
+            self._screen,
+            self._owner,
+            self._normals,
+            self._uvs,
+            self._places,
+            self._levels,
+            self._texels,
+            colors,
+            poses,
+            self._groups,
+            self._vertices,
+            LIGHT,
+            HIGHLIGHT_EYE,
+            self._shadow,
+            canvas,
+        )
 
     def _finish(self, canvas: np.ndarray, closeness: np.ndarray, poses: np.ndarray) -> np.ndarray:
         if not np.array_equal(poses, self._shadow_of):  # both cameras see the same shadow
@@ -82,9 +97,7 @@ class OpenGLLook(FastRenderer):
         matrices = (self._shadow @ poses).astype(np.float32)
         for index in groups:
             part = self._parts[index]
-            raster.project_flat(
-                self._vertices[:, part.vertices], matrices[index], self._screen[part.vertices]
-            )
+            raster.project_flat(self._vertices[:, part.vertices], matrices[index], self._screen[part.vertices])
             first, last = part.faces.start, part.faces.stop
             raster.nearest(
                 self._faces,

@@ -17,7 +17,7 @@ class Links:
     """The joints of one body as fixed transforms.
 
     Attributes:
-        moving: Joints that move, in the order in which :meth:`poses` takes their positions.
+        moving: Joints that move, in the order in which `poses` takes their positions.
     """
 
     def __init__(self, client: int, body: int):
@@ -30,17 +30,14 @@ class Links:
         inertial = [self._inertial(client, body, link) for link in range(-1, count)]
         # Bullet states a joint's place in its parent's inertial frame, with the rotation inverted
         self._joints = np.array(
-            [
-                inertial[info[16] + 1] @ transform(info[14], p.invertTransform((0, 0, 0), info[15])[1])
-                for info in infos
-            ]
+            [inertial[info[16] + 1] @ transform(info[14], p.invertTransform((0, 0, 0), info[15])[1]) for info in infos]
         ).reshape(-1, 4, 4)
         base = transform(*p.getBasePositionAndOrientation(body, physicsClientId=client))
         self._base = base @ np.linalg.inv(inertial[0])
         self.moving = [joint for joint in range(count) if self._kinds[joint]]
 
     def moves(self, link: int) -> bool:
-        """Whether some joint between the base and ``link`` moves."""
+        """Whether some joint between the base and `link` moves."""
         while link >= 0:
             if self._kinds[link]:
                 return True
@@ -56,7 +53,7 @@ class Links:
         """URDF frames of the base and of every link in world coordinates.
 
         Args:
-            positions: One number (rad or m) per joint in :attr:`moving`.
+            positions: One number (rad or m) per joint in `moving`.
 
         Returns:
             (1 + links, 4, 4) float64; row 0 is the base.

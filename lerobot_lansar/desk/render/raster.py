@@ -16,7 +16,7 @@ RANKS = 256
 def outside(matrix, center, radius, size):  # type: ignore[no-untyped-def]
     """Whether a sphere (3,), m, lies beyond one of the four sides of the picture.
 
-    ``matrix`` (3, 4) maps points to homogeneous pixels (column * w, row * w, w), w the distance along the view axis.
+    `matrix` (3, 4) maps points to homogeneous pixels (column * w, row * w, w), w the distance along the view axis.
     """
     for side in range(4):
         row = side // 2
@@ -32,7 +32,7 @@ def outside(matrix, center, radius, size):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def project(vertices, matrix, screen):  # type: ignore[no-untyped-def]
-    """Vertices (3, V) to ``screen`` (V, 3): column, row, w. Returns whether any lies behind the eye."""
+    """Vertices (3, V) to `screen` (V, 3): column, row, w. Returns whether any lies behind the eye."""
     m00, m01, m02, m03 = matrix[0]
     m10, m11, m12, m13 = matrix[1]
     m20, m21, m22, m23 = matrix[2]
@@ -49,10 +49,10 @@ def project(vertices, matrix, screen):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def nearest(faces, first, last, screen, behind, limits, smallest, rule, closeness, ids):  # type: ignore[no-untyped-def]
-    """Enters faces ``first`` to ``last`` into the buffers of closeness (H, W) float32 and of face numbers (H, W) int32.
+    """Enters faces `first` to `last` into the buffers of closeness (H, W) float32 and of face numbers (H, W) int32.
 
-    Faces seen from behind, and faces of less than ``smallest`` doubled square pixels, are left out. ``limits`` (near,
-    far) m: nothing nearer or farther is drawn. ``rule`` (offset, scale, rank) says what closeness is: with scale 0
+    Faces seen from behind, and faces of less than `smallest` doubled square pixels, are left out. `limits` (near,
+    far) m: nothing nearer or farther is drawn. `rule` (offset, scale, rank) says what closeness is: with scale 0
     it is 1 / w and of two equals the later one stays; else it is round(offset + scale / w) * RANKS + rank, a depth
     buffer of few bits, and of two equals the one of higher rank stays, or the earlier one.
     """
@@ -77,9 +77,26 @@ def nearest(faces, first, last, screen, behind, limits, smallest, rule, closenes
         if not ((area > smallest) & (x0 <= x1) & (y0 <= y1)):
             continue
         _fill(
-            f, xa, ya, screen[a, 2], xb, yb, screen[b, 2], xc, yc, screen[c, 2], x0, x1, y0, y1, near, far, rule,
-            closeness, ids,
-        )  # fmt: skip
+            f,
+            xa,
+            ya,
+            screen[a, 2],
+            xb,
+            yb,
+            screen[b, 2],
+            xc,
+            yc,
+            screen[c, 2],
+            x0,
+            x1,
+            y0,
+            y1,
+            near,
+            far,
+            rule,
+            closeness,
+            ids,
+        )
 
 
 @njit(cache=True, error_model="numpy")
@@ -142,9 +159,26 @@ def _clipped(f, a, b, c, screen, limits, smallest, rule, closeness, ids):  # typ
         y0 = int(np.ceil(max(min(pa[1], pb[1], pc[1]), 0)))
         y1 = int(np.floor(min(max(pa[1], pb[1], pc[1]), size - 1)))
         _fill(
-            f, pa[0], pa[1], pa[2], pb[0], pb[1], pb[2], pc[0], pc[1], pc[2], x0, x1, y0, y1, np.inf, 1 / limits[1],
-            rule, closeness, ids,
-        )  # fmt: skip
+            f,
+            pa[0],
+            pa[1],
+            pa[2],
+            pb[0],
+            pb[1],
+            pb[2],
+            pc[0],
+            pc[1],
+            pc[2],
+            x0,
+            x1,
+            y0,
+            y1,
+            np.inf,
+            1 / limits[1],
+            rule,
+            closeness,
+            ids,
+        )
 
 
 @njit(cache=True, error_model="numpy")
@@ -166,9 +200,9 @@ def shade_tiny(ids, faces, screen, owner, normals, uvs, places, texels, colors, 
     """TinyRenderer's light on every pixel that shows a face: 60 % ambient, 35 % diffuse, 5 % specular, no shadow.
 
     Args:
-        ids: (H, W) int32 face numbers, :data:`NOTHING` where the picture stays as it is.
-        owner: (F,) which shape a face belongs to; ``places`` (S, 3) first texel, width and height of its texture (no
-            texture: width 0); ``colors`` (S, 4); ``lights`` and ``up`` (S, 3), the direction of the light and of the
+        ids: (H, W) int32 face numbers, `NOTHING` where the picture stays as it is.
+        owner: (F,) which shape a face belongs to; `places` (S, 3) first texel, width and height of its texture (no
+            texture: width 0); `colors` (S, 4); `lights` and `up` (S, 3), the direction of the light and of the
             world's z axis in the shape's frame.
         texels: (T, 3) uint8.
         picture: (H, W, 3) uint8, row 0 on top.
@@ -210,16 +244,31 @@ def shade_tiny(ids, faces, screen, owner, normals, uvs, places, texels, colors, 
 
 @njit(cache=True, error_model="numpy")
 def light_gl(
-    ids, faces, screen, owner, normals, uvs, places, levels, texels, colors, poses, groups, vertices, light, eye,
-    shadow, surface,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+    ids,
+    faces,
+    screen,
+    owner,
+    normals,
+    uvs,
+    places,
+    levels,
+    texels,
+    colors,
+    poses,
+    groups,
+    vertices,
+    light,
+    eye,
+    shadow,
+    surface,
+):  # type: ignore[no-untyped-def]
     """What Bullet's OpenGL shader makes of every pixel that shows a face, but for the shadow.
 
     Args:
-        ids, faces, screen, owner, normals, uvs, colors: As in :func:`shade_tiny`.
-        places: (S, 2) first mipmap level in ``levels`` and number of levels, 0 without texture.
-        levels: (L, 3) first texel, width and height; ``texels`` (T, 3) uint8.
-        poses: (G, 4, 4) link frames; ``groups`` (S,) the group of a shape; ``vertices`` (3, V) in the link frames.
+        ids, faces, screen, owner, normals, uvs, colors: As in `shade_tiny`.
+        places: (S, 2) first mipmap level in `levels` and number of levels, 0 without texture.
+        levels: (L, 3) first texel, width and height; `texels` (T, 3) uint8.
+        poses: (G, 4, 4) link frames; `groups` (S,) the group of a shape; `vertices` (3, V) in the link frames.
         light, eye: (3,) positions of the light and of the eye that the highlights are for.
         shadow: (3, 4) world to shadow map column, row and height towards the light.
         surface: (H, W, 8) float32 to fill: albedo (3), light 0 to 1, highlight, shadow map column, row, height.
@@ -241,13 +290,13 @@ def light_gl(
                 rgb[i] = ba * vertices[i, a] + bb * vertices[i, b] + bc * vertices[i, c]
             square = 0.0
             for i in range(3):
-                normal[i] = (
-                    poses[pose, i, 0] * local[0] + poses[pose, i, 1] * local[1] + poses[pose, i, 2] * local[2]
-                )
+                normal[i] = poses[pose, i, 0] * local[0] + poses[pose, i, 1] * local[1] + poses[pose, i, 2] * local[2]
                 point[i] = (
-                    poses[pose, i, 0] * rgb[0] + poses[pose, i, 1] * rgb[1] + poses[pose, i, 2] * rgb[2]
+                    poses[pose, i, 0] * rgb[0]
+                    + poses[pose, i, 1] * rgb[1]
+                    + poses[pose, i, 2] * rgb[2]
                     + poses[pose, i, 3]
-                )  # fmt: skip
+                )
                 square += normal[i] * normal[i]
             toward = 0.0
             for i in range(3):
@@ -281,7 +330,7 @@ def light_gl(
 
 @njit(cache=True, error_model="numpy")
 def _sample(f, x, y, ba, bb, bc, faces, screen, uvs, first, count, levels, texels, rgb):  # type: ignore[no-untyped-def]
-    """Trilinear texture lookup into ``rgb`` (3,), 0 to 1; the mipmap level follows from the neighbours' coordinates."""
+    """Trilinear texture lookup into `rgb` (3,), 0 to 1; the mipmap level follows from the neighbours' coordinates."""
     u = ba * uvs[f, 0, 0] + bb * uvs[f, 1, 0] + bc * uvs[f, 2, 0]
     v = ba * uvs[f, 0, 1] + bb * uvs[f, 1, 1] + bc * uvs[f, 2, 1]
     width, height = levels[first, 1], levels[first, 2]
@@ -320,7 +369,7 @@ def compose_gl(surface, closeness, heights, step, picture):  # type: ignore[no-u
     """Light, highlight and shadow of every pixel become its colour.
 
     Args:
-        surface: From :func:`light_gl`.
+        surface: From `light_gl`.
         closeness: (H, W), 0 where there is nothing to see.
         heights: (S, S) float32 shadow map: height of the highest back face towards the light, 0 for none.
         step: The height that one step of the original's 16-bit map stands for, m.
@@ -351,7 +400,7 @@ def compose_gl(surface, closeness, heights, step, picture):  # type: ignore[no-u
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def project_flat(vertices, matrix, screen):  # type: ignore[no-untyped-def]
-    """As :func:`project` without perspective: column, row and 1 / the third coordinate."""
+    """As `project` without perspective: column, row and 1 / the third coordinate."""
     x, y, z = vertices[0], vertices[1], vertices[2]
     for v in range(x.size):
         screen[v, 0] = matrix[0, 0] * x[v] + matrix[0, 1] * y[v] + matrix[0, 2] * z[v] + matrix[0, 3]

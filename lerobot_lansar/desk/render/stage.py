@@ -38,9 +38,7 @@ class Stage:
     def __init__(self, client: int, visuals: Sequence[Visual], repainted: Collection[tuple[int, int]]):
         self._client = client
         bodies = list(dict.fromkeys(visual.body for visual in visuals))
-        self._jointed = {
-            body: Links(client, body) for body in bodies if p.getNumJoints(body, physicsClientId=client)
-        }
+        self._jointed = {body: Links(client, body) for body in bodies if p.getNumJoints(body, physicsClientId=client)}
         self._inertial = {body: p.getDynamicsInfo(body, -1, physicsClientId=client) for body in bodies}
         self._free = [b for b in bodies if b not in self._jointed and self._inertial[b][0] > 0]
         keys = list(dict.fromkeys((visual.body, visual.link) for visual in visuals))

@@ -1,4 +1,4 @@
-"""``renderer="fast"``: the pictures that PyBullet's TinyRenderer draws."""
+"""`renderer="fast"`: the pictures that PyBullet's TinyRenderer draws."""
 
 import numpy as np
 
@@ -28,9 +28,19 @@ class TinyLook(FastRenderer):
     def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
         rotations = poses[self._groups, :3, :3]
         raster.shade_tiny(
-            ids, self._faces, self._screen, self._owner, self._normals, self._uvs, self._places, self._texels, colors,
-            LIGHT @ rotations, rotations[:, 2], canvas,
-        )  # fmt: skip
+            ids,
+            self._faces,
+            self._screen,
+            self._owner,
+            self._normals,
+            self._uvs,
+            self._places,
+            self._texels,
+            colors,
+            LIGHT @ rotations,
+            rotations[:, 2],
+            canvas,
+        )
 
     def _finish(self, canvas: np.ndarray, closeness: np.ndarray, poses: np.ndarray) -> np.ndarray:
         return canvas

@@ -25,7 +25,7 @@ class Mesh:
 
     Attributes:
         vertices: (V, 3) float32 positions, m.
-        faces: (F, 3) int32 rows of ``vertices``, counter-clockwise seen from outside.
+        faces: (F, 3) int32 rows of `vertices`, counter-clockwise seen from outside.
         normals: (F, 3, 3) float32 unit normal of each corner.
         uvs: (F, 3, 2) float32 texture coordinates of each corner, v upwards.
         texture: (height, width, 3) uint8 with row 0 on top, or None.
@@ -38,12 +38,10 @@ class Mesh:
     texture: np.ndarray | None = None
 
     def placed(self, scale: np.ndarray, frame: np.ndarray) -> "Mesh":
-        """The mesh scaled by (3,) and then moved by the rigid transform ``frame`` (4, 4)."""
+        """The mesh scaled by (3,) and then moved by the rigid transform `frame` (4, 4)."""
         vertices = (self.vertices * scale) @ frame[:3, :3].T + frame[:3, 3]
         normals = self.normals @ frame[:3, :3].T
-        return Mesh(
-            vertices.astype(np.float32), self.faces, normals.astype(np.float32), self.uvs, self.texture
-        )
+        return Mesh(vertices.astype(np.float32), self.faces, normals.astype(np.float32), self.uvs, self.texture)
 
 
 @dataclass(frozen=True)

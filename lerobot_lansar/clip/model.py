@@ -28,8 +28,8 @@ class ClipConfig:
     """Which CLIP.
 
     Attributes:
-        model: an open_clip model name ("ViT-B-32") or one that comes with this package ("lansar-tiny").
-        pretrained: an open_clip tag ("openai"), a local weights file, or "" for random weights from a fixed
+        model: An open_clip model name ("ViT-B-32") or one that comes with this package ("lansar-tiny").
+        pretrained: An open_clip tag ("openai"), a local weights file, or "" for random weights from a fixed
             seed.
     """
 
@@ -70,7 +70,7 @@ def embedding_size(model: str) -> int:
     """D of a model, without building it.
 
     Raises:
-        ValueError: an unknown model name.
+        ValueError: An unknown model name.
     """
     return int(_model_config(model)["embed_dim"])
 
@@ -84,15 +84,15 @@ class Clip:
     """Both towers of one CLIP, frozen, in float32.
 
     Args:
-        config: model and weights.
-        device: where the towers live and compute.
-        weights: a state dict to use instead of `config.pretrained` (from a checkpoint).
+        config: Model and weights.
+        device: Where the towers live and compute.
+        weights: A state dict to use instead of `config.pretrained` (from a checkpoint).
 
     Attributes:
         embed_dim: D.
 
     Raises:
-        ValueError: an unknown model name, or a `pretrained` that is neither a tag nor an existing file.
+        ValueError: An unknown model name, or a `pretrained` that is neither a tag nor an existing file.
     """
 
     def __init__(
@@ -156,15 +156,14 @@ class Clip:
             (B, D) float32 on this CLIP's device.
 
         Raises:
-            ValueError: another shape or dtype.
+            ValueError: Another shape or dtype.
         """
         x = torch.as_tensor(images)
         if x.dtype == torch.uint8 and x.ndim == 4 and x.shape[-1] == 3:
             x = x.to(self.device).permute(0, 3, 1, 2).float() / 255
         elif not (x.is_floating_point() and x.ndim == 4 and x.shape[1] == 3):
             raise ValueError(
-                f"images must be uint8 (B, H, W, 3) or float (B, 3, H, W) in [0, 1], "
-                f"got {x.dtype} {tuple(x.shape)}."
+                f"images must be uint8 (B, H, W, 3) or float (B, 3, H, W) in [0, 1], got {x.dtype} {tuple(x.shape)}."
             )
         x = x.to(self.device, torch.float32)
         # CALVIN's pictures are square, so a plain resize is open_clip's resize and centre crop.

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import yaml
 
+from ..calvin import COLORS, TASKS
 from .errors import DeskError
-from .oracle import TASKS
-from .scenes import COLORS
 
 _BLOCK = "the {color} (block|cube)"
 
@@ -204,7 +203,7 @@ _GRAMMAR: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
 }
-"""Task to patterns of training and of validation sentences; ``(a|b|)`` stands for one of a, b and nothing."""
+"""Task to patterns of training and of validation sentences; `(a|b|)` stands for one of a, b and nothing."""
 
 _ALTERNATIVES = re.compile(r"\(([^()]*)\)")
 
@@ -239,11 +238,11 @@ COMMANDS: dict[str, dict[str, list[str]]] = {"training": _sentences(0), "validat
 
 
 def load_commands(file: str | Path | None, split: str) -> dict[str, list[str]]:
-    """Sentences by task: those of :data:`COMMANDS`, or those of ``file`` for the tasks that it has.
+    """Sentences by task: those of `COMMANDS`, or those of `file` for the tasks that it has.
 
     Args:
         file: YAML, task name to a sentence or a list of sentences, as in CALVIN's annotation files; or None.
-        split: ``"training"`` or ``"validation"``.
+        split: `"training"` or `"validation"`.
 
     Raises:
         DeskError: The file is missing, is not of that form, or names a task that does not exist.
@@ -259,9 +258,7 @@ def load_commands(file: str | Path | None, split: str) -> dict[str, list[str]]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DeskError(f"annotations file {path} is not YAML: {error}") from error
     if not isinstance(content, dict):
-        raise DeskError(
-            f"annotations file {path} must map task names to sentences, got {type(content).__name__}"
-        )
+        raise DeskError(f"annotations file {path} must map task names to sentences, got {type(content).__name__}")
     for task, sentences in content.items():
         if task not in TASKS:
             raise DeskError(f"annotations file {path} names the unknown task {task!r}")

@@ -1,11 +1,11 @@
-"""``lansar-attention``: what a LanSAR attends to during one rollout (Figures 6.1 and 6.4 to 6.8 of the thesis).
+"""`lansar-attention`: what a LanSAR attends to during one rollout (Figures 6.1 and 6.4 to 6.8 of the thesis).
 
     lansar-attention --policy.path=DIR --env.type=calvin --env.task=rotate_red_block_right --seed=0
 
-Runs one episode with LeRobot's own rollout and writes into ``--output_dir``:
+Runs one episode with LeRobot's own rollout and writes into `--output_dir`:
 
     context_attention.png   how much each modality is attended to in the context encoder at every step, above it frames
-    decoder_attention.png   what the decoder attends to at the steps of ``--decoder_steps``, below their frames
+    decoder_attention.png   what the decoder attends to at the steps of `--decoder_steps`, below their frames
     rollout.mp4             the static camera
     attention.npz           the weights themselves, see `save`
 """
@@ -15,9 +15,9 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import torch
-from draccus.utils import DraccusException
 from lerobot.configs import parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs.factory import make_env, make_env_pre_post_processors
@@ -27,16 +27,20 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.io_utils import write_video
 from lerobot.utils.random_utils import set_seed
 
-from ..desk.errors import DeskError
-from ..envs.configuration_calvin import CalvinEnvConfig
-from ..policy.modeling_lansar import LanSARPolicy
-from ..policy.network import recorded_attention
-from .plots import plot_context_attention, plot_decoder_attention
+from .command import run_command
+from .envs.configuration_calvin import CalvinEnvConfig
+from .policy.modeling_lansar import LanSARPolicy
+from .policy.network import recorded_attention
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+FRAMES = 9  # of a rollout, above its heat map
 
 
 @dataclass
 class AttentionConfig(EvalPipelineConfig):
-    """Options of ``lerobot-eval``, and which of the decoder's decisions to draw."""
+    """Options of `lerobot-eval`, and which of the decoder's decisions to draw."""
 
     # Control steps, counted from 0, at which the decoder's attention is drawn; those after the episode's end are not.
     decoder_steps: list[int] = field(default_factory=lambda: [0, 30])
@@ -47,14 +51,14 @@ class Attention:
     """Attention weights of one rollout of T control steps; heads and layers are not mixed.
 
     Attributes:
-        tokens: names of the k tokens of a timestep, CLS first.
+        tokens: Names of the k tokens of a timestep, CLS first.
         context: (T, layers, heads, k, k) float32, rows attend to columns. In the last layer CLS alone attends, since
             only it is read; the other rows are NaN.
-        decoder: per step {"self" and "cross": (layers, heads, s) float32}: from the newest X to the s tokens of the
+        decoder: Per step {"self" and "cross": (layers, heads, s) float32}: from the newest X to the s tokens of the
             window, C and X (self) or C and E (cross) in turn.
         frames: (T, 200, 200, 3) uint8, the static camera before each step.
-        commands: the T commands in force.
-        prepended: whether C stands only once, at the front of the window.
+        commands: The T commands in force.
+        prepended: Whether C stands only once, at the front of the window.
     """
 
     tokens: list[str]
@@ -71,13 +75,11 @@ class Attention:
         return len(self.tokens) * np.nanmean(self.context, axis=3).mean(axis=(1, 2))
 
     def save(self, path: Path) -> None:
-        """Writes ``tokens``, ``context``, ``commands``, ``prepended`` and, for each step t, ``decoder_self_t`` and
-        ``decoder_cross_t`` into one .npz file (no pickles).
+        """Writes `tokens`, `context`, `commands`, `prepended` and, for each step t, `decoder_self_t` and
+        `decoder_cross_t` into one .npz file (no pickles).
         """
         decoder = {
-            f"decoder_{kind}_{t}": weights
-            for t, step in enumerate(self.decoder)
-            for kind, weights in step.items()
+            f"decoder_{kind}_{t}": weights for t, step in enumerate(self.decoder) for kind, weights in step.items()
         }
         np.savez_compressed(
             path,
@@ -90,11 +92,11 @@ class Attention:
 
 
 def observe(config: AttentionConfig) -> Attention:
-    """Runs one episode, of the first of ``--env.task``'s tasks, from ``--seed``.
+    """Runs one episode, of the first of `--env.task`'s tasks, from `--seed`.
 
     Raises:
-        ValueError: the policy is no LanSAR.
-        DeskError: the environment cannot be had.
+        ValueError: The policy is no LanSAR.
+        DeskError: The environment cannot be had.
     """
     if config.policy is None or config.policy.type != "lansar" or not config.policy.pretrained_path:
         found = "none" if config.policy is None else f"an untrained policy of type {config.policy.type}"
@@ -121,13 +123,9 @@ def observe(config: AttentionConfig) -> Attention:
 
     def collect(_: LanSARPolicy) -> None:
         k = len(network.context_tokens)
-        layers = [
-            weights.pop()[0].float().cpu().numpy() for weights in in_context.values()
-        ]  # (heads, k or 1, k)
+        layers = [weights.pop()[0].float().cpu().numpy() for weights in in_context.values()]  # (heads, k or 1, k)
         context.append(
-            np.stack(
-                [np.pad(w, ((0, 0), (0, k - w.shape[1]), (0, 0)), constant_values=np.nan) for w in layers]
-            )
+            np.stack([np.pad(w, ((0, 0), (0, k - w.shape[1]), (0, 0)), constant_values=np.nan) for w in layers])
         )
         newest = {name: weights.pop()[0, :, -1].float().cpu().numpy() for name, weights in in_decoder.items()}
         decoder.append(
@@ -145,17 +143,81 @@ def observe(config: AttentionConfig) -> Attention:
             recorded_attention(network.decoder_layers) as in_decoder,
         ):
             rollout(
-                env, policy, env_preprocessor, env_postprocessor, preprocessor, postprocessor,
+                env,
+                policy,
+                env_preprocessor,
+                env_postprocessor,
+                preprocessor,
+                postprocessor,
                 seeds=None if config.seed is None else [config.seed],
                 render_callback=lambda env: frames.append(env.call("render")[0]),
                 predicted_latents_callback=collect,
-            )  # fmt: skip
+            )
     finally:
         env.close()
     return Attention(
-        list(network.context_tokens), np.stack(context), decoder, np.stack(frames[: len(context)]), commands,
+        list(network.context_tokens),
+        np.stack(context),
+        decoder,
+        np.stack(frames[: len(context)]),
+        commands,
         network.config.command_prepended,
-    )  # fmt: skip
+    )
+
+
+def plot_context_attention(attention: Attention, path: Path) -> None:
+    """Heat map: attention to each modality (rows) at each step (columns), under frames of the rollout (Figure 6.4)."""
+    weights, steps = attention.per_modality(), len(attention.context)
+    shown = np.unique(np.linspace(0, steps - 1, FRAMES).round().astype(int))
+    figure = plt.figure(figsize=(12, 5.5), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1, 2))  # type: ignore[misc]
+    for axes, step in zip(np.atleast_1d(above.subplots(1, len(shown))), shown, strict=True):
+        axes.imshow(attention.frames[step])
+        axes.set_title(f"step {step}", fontsize=8)
+        axes.axis("off")
+    axes = below.subplots()
+    image = axes.imshow(weights.T, aspect="auto", interpolation="nearest", cmap="viridis", vmin=0)
+    axes.set(xlabel="control step", yticks=range(len(attention.tokens)), yticklabels=attention.tokens)
+    for step in [t for t in range(1, steps) if attention.commands[t] != attention.commands[t - 1]]:
+        axes.axvline(step - 0.5, color="white", linewidth=1)
+    below.colorbar(image, ax=axes, label="attention (1 = indifferent)")
+    sentences = list(dict.fromkeys(attention.commands))
+    axes.set_title("context encoder: " + "; ".join(f"“{sentence}”" for sentence in sentences), fontsize=10)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def plot_decoder_attention(attention: Attention, steps: list[int], path: Path) -> None:
+    """Heat maps: from the newest step to the window's tokens, per decoder layer, mean over heads (Figure 6.1); above
+    them the static camera's picture of that step.
+    """
+    steps = [step for step in steps if step < len(attention.decoder)] or [len(attention.decoder) - 1]
+    figure, grid = plt.subplots(3, len(steps), figsize=(1 + 5.5 * len(steps), 8), squeeze=False, layout="constrained")
+    for column, step in enumerate(steps):
+        grid[0, column].imshow(attention.frames[step])
+        grid[0, column].set_title(f"step {step}: “{attention.commands[step]}”", fontsize=9)
+        grid[0, column].axis("off")
+        for axes, (kind, other) in zip(grid[1:, column], (("self", "X"), ("cross", "E")), strict=True):
+            weights = attention.decoder[step][kind].mean(axis=1)  # (layers, tokens)
+            count = weights.shape[1]
+            if attention.prepended:
+                names = ["C", *(f"{other}{i}" for i in range(count - 1))]
+            else:
+                names = [("C" if i % 2 == 0 else other) + str(i // 2) for i in range(count)]
+            image = axes.imshow(weights, aspect="auto", interpolation="nearest", cmap="viridis", vmin=0)
+            # every token, or some of the odd ones: X or E
+            labelled = range(count) if count <= 16 else range(1, count, 2 * (count // 32 + 1))
+            axes.set(
+                xticks=labelled,
+                xticklabels=[names[i] for i in labelled],
+                yticks=range(len(weights)),
+                ylabel="layer",
+                title=f"{kind}-attention",
+            )
+            axes.tick_params(axis="x", labelrotation=90, labelsize=7)
+            figure.colorbar(image, ax=axes)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
 
 
 @parser.wrap()
@@ -174,16 +236,12 @@ def run(config: AttentionConfig) -> None:
     print(f"{len(attention.context)} steps; attention.npz, rollout.mp4 and the plots are in {folder}")
 
 
-def main() -> None:
-    """Entry point of ``lansar-attention``."""
+def main() -> int:
+    """Entry point of `lansar-attention`."""
     register_third_party_plugins()
     logging.basicConfig(level=logging.WARNING)
-    try:
-        run()
-    except (DeskError, OSError, ValueError, DraccusException) as error:
-        print(f"lansar-attention: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    return run_command("lansar-attention", run)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -2,21 +2,22 @@
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from lerobot_lansar import executors
+from lerobot_lansar.jobs import executors
 
 OPTIONS = [
-    "--cameras=[]", "--episodes=9", "--validation_episodes=1", "--tasks=[turn_on_led,open_drawer]", "--seed=5",
-]  # fmt: skip
+    "--cameras=[]",
+    "--episodes=9",
+    "--validation_episodes=1",
+    "--tasks=[turn_on_led,open_drawer]",
+    "--seed=5",
+]
 
 SBATCH = """#!/usr/bin/env python3
 import os, re, subprocess, sys
@@ -38,9 +39,7 @@ exec "$@"
 
 def run(module, output, *options, **environment):
     command = [sys.executable, "-m", module, f"--output_dir={output}", *options]
-    done = subprocess.run(
-        command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600
-    )
+    done = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -96,9 +95,7 @@ def slurm(tmp_path):
 
 
 def test_slurm_jobs_record_the_same(local, slurm, tmp_path):
-    printed = record(
-        tmp_path / "desk", "--executor=slurm", "--workers=2", "--slurm.partition=cpu", PATH=slurm
-    )
+    printed = record(tmp_path / "desk", "--executor=slurm", "--workers=2", "--slurm.partition=cpu", PATH=slurm)
     assert "submitted" in printed
     assert_same(local, tmp_path / "desk")
     script = (tmp_path / "desk" / ".recording-slurm" / "work" / "launch_script.slurm").read_text()
@@ -116,9 +113,7 @@ def leave_note(folder, shard):
     (folder / f"{shard}").touch()
 
 
-def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_failed(
-    slurm, tmp_path, monkeypatch
-):
+def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_failed(slurm, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", slurm)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # the jobs import leave_note
     done, finished = tmp_path / "done", tmp_path / "finished"
@@ -127,10 +122,17 @@ def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_f
     def submit():
         done.mkdir()
         return executors.run_shards(
-            (leave_note, (done,)), 3, (leave_note, (finished,)), executor="slurm", workers=2,
-            slurm=executors.SlurmConfig(partition="cpu", shards_per_job=2), logging_dir=tmp_path / "logs",
-            progress=lambda: 0, total=3, unit="note",
-        )  # fmt: skip
+            (leave_note, (done,)),
+            3,
+            (leave_note, (finished,)),
+            executor="slurm",
+            workers=2,
+            slurm=executors.SlurmConfig(partition="cpu", shards_per_job=2),
+            logging_dir=tmp_path / "logs",
+            progress=lambda: 0,
+            total=3,
+            unit="note",
+        )
 
     refuse = 'if "--job-name=lansar-finish" in script:\n    sys.exit("too many jobs")\narray ='
     (tmp_path / "sbatch").write_text(SBATCH.replace("array =", refuse, 1))
@@ -138,9 +140,7 @@ def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_f
     (tmp_path / "scancel").chmod(0o755)
     with pytest.raises(subprocess.CalledProcessError):
         submit()
-    assert set((tmp_path / "cancelled").read_text().split()) == {"42"}, (
-        "jobs without a finish run for nothing"
-    )
+    assert set((tmp_path / "cancelled").read_text().split()) == {"42"}, "jobs without a finish run for nothing"
     assert not list(finished.iterdir())
     (tmp_path / "sbatch").write_text(SBATCH)
     for _ in range(2):
@@ -169,30 +169,6 @@ def test_ray_records_the_same(local, tmp_path):
     pytest.importorskip("ray", reason="needs the extra ray")
     record(tmp_path / "desk", "--executor=ray", "--workers=2")
     assert_same(local, tmp_path / "desk")
-
-
-def test_a_pool_that_hangs_after_a_worker_died_is_interrupted_until_it_ends(monkeypatch):
-    """Such a hang was seen once: a worker may be killed while it holds a lock of the pool."""
-    monkeypatch.setattr(executors, "_GRACE", 0.2)
-    pools = iter([[SimpleNamespace(pid=1, name="PoolWorker-1")]])
-    monkeypatch.setattr(executors.multiprocess, "active_children", lambda: next(pools, []))
-    interrupted, before = [], signal.getsignal(signal.SIGINT)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a job that a script left in the background
-
-    def hang():
-        with executors._watched(lambda: 0, 1, "shard", "working"):
-            try:
-                time.sleep(30)
-            except KeyboardInterrupt:
-                interrupted.append(True)
-                time.sleep(30)
-
-    try:
-        with pytest.raises(executors.WorkerDied, match="a worker process was killed"):
-            hang()
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert interrupted == [True]
 
 
 def test_slurm_jobs_convert_the_same(local, converted, slurm, tmp_path):

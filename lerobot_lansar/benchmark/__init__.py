@@ -7,7 +7,8 @@ from importlib import resources
 
 import numpy as np
 
-CHAIN_LENGTH = 5
+LH_MTLC = "lh_mtlc"
+"""The name under which the benchmark is asked for."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,7 @@ def load_chains() -> tuple[Chain, ...]:
     folder = resources.files(__package__)
     states = json.loads((folder / "initial_states.json").read_text())
     robot_obs = np.array(states["robot_obs"])
-    scene_obs = {
-        json.dumps(entry["initial_condition"]): np.array(entry["scene_obs"]) for entry in states["conditions"]
-    }
+    scene_obs = {json.dumps(entry["initial_condition"]): np.array(entry["scene_obs"]) for entry in states["conditions"]}
     return tuple(
         Chain(tuple(chain["tasks"]), robot_obs, scene_obs[json.dumps(chain["initial_condition"])])
         for chain in json.loads((folder / "chains.json").read_text())

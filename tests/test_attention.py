@@ -1,4 +1,4 @@
-"""``lansar-attention``: the weights of a real rollout, and the files made of them."""
+"""`lansar-attention`: the weights of a real rollout, and the files made of them."""
 
 import sys
 
@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import lerobot_policy_lansar  # noqa: F401  (registers environment and policy)
-from lerobot_lansar.policy.clip import ClipConfig
+from lerobot_lansar import attention as attention_module
+from lerobot_lansar.clip.model import ClipConfig
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.processor_lansar import make_lansar_pre_post_processors
-from lerobot_lansar.report import attention as attention_module
 
 SMALL = {"hidden": 32, "context_layers": 2, "context_heads": 2, "decoder_layers": 3, "decoder_heads": 2}
 
@@ -20,9 +20,14 @@ SMALL = {"hidden": 32, "context_layers": 2, "context_heads": 2, "decoder_layers"
 def checkpoint(tmp_path):
     torch.manual_seed(0)
     config = LanSARConfig(
-        device="cpu", push_to_hub=False, feedforward=64, use_images=False, window=8,
-        clip=ClipConfig("lansar-tiny", ""), **SMALL,
-    )  # fmt: skip
+        device="cpu",
+        push_to_hub=False,
+        feedforward=64,
+        use_images=False,
+        window=8,
+        clip=ClipConfig("lansar-tiny", ""),
+        **SMALL,
+    )
     config.input_features, config.output_features = {}, {}
     folder = tmp_path / "checkpoint"
     for part in (LanSARPolicy(config), *make_lansar_pre_post_processors(config)):
@@ -40,10 +45,16 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
     observe = attention_module.observe
     monkeypatch.setattr(attention_module, "observe", lambda config: seen.append(observe(config)) or seen[-1])
     run(
-        monkeypatch, f"--policy.path={checkpoint}", "--env.type=calvin", "--env.task=open_drawer",
-        "--env.cameras=[]", "--env.steps_per_command=20", "--seed=3",
-        "--decoder_steps=[0,10,99]", f"--output_dir={tmp_path / 'out'}",
-    )  # fmt: skip
+        monkeypatch,
+        f"--policy.path={checkpoint}",
+        "--env.type=calvin",
+        "--env.task=open_drawer",
+        "--env.cameras=[]",
+        "--env.steps_per_command=20",
+        "--seed=3",
+        "--decoder_steps=[0,10,99]",
+        f"--output_dir={tmp_path / 'out'}",
+    )
     (attention,) = seen
     assert attention.tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S", "C"]
     assert attention.context.shape == (20, 2, 2, 7, 7)
@@ -53,9 +64,7 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
     np.testing.assert_allclose(sums[:, 1, :, 0], 1, atol=1e-5)
     assert np.isnan(sums[:, 1, :, 1:]).all()  # of the last layer CLS alone is read
     np.testing.assert_allclose(attention.per_modality().sum(1), 7, atol=1e-4)
-    lengths = [
-        step["self"].shape[-1] for step in attention.decoder
-    ]  # two tokens a step; half is forgotten at 8
+    lengths = [step["self"].shape[-1] for step in attention.decoder]  # two tokens a step; half is forgotten at 8
     assert lengths == [2, 4, 6, 8, 10, 12, 14, 16, *[10, 12, 14, 16] * 3]
     for step in attention.decoder:
         assert step["cross"].shape[:2] == (3, 2)
@@ -72,6 +81,5 @@ def test_other_policies_are_refused(monkeypatch, capsys):
         run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", "--env.type=calvin")
     assert stopped.value.code == 2
     assert (
-        "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act"
-        in capsys.readouterr().err
+        "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act" in capsys.readouterr().err
     )

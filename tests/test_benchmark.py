@@ -6,7 +6,7 @@ from importlib import resources
 
 import numpy as np
 
-from lerobot_lansar.envs.benchmark import load_chains
+from lerobot_lansar.benchmark import load_chains
 
 SHA256 = {
     "chains.json": "176a61a34e4506b18465e40ed82a102f5380bd8b0e172958fabbaed7a20dcc71",
@@ -16,7 +16,7 @@ SHA256 = {
 
 def test_frozen_files_are_unchanged():
     for name, expected in SHA256.items():
-        content = (resources.files("lerobot_lansar.envs") / name).read_bytes()
+        content = (resources.files("lerobot_lansar.benchmark") / name).read_bytes()
         assert hashlib.sha256(content).hexdigest() == expected, name
 
 

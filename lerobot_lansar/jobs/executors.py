@@ -1,0 +1,145 @@
+"""Runs work that is cut into shards, then one finishing step: in local processes, under Slurm or on Ray.
+
+A shard's number decides what it does, so the result is the same wherever and however often it runs. Each shard checks
+for its own output; datatrove's completion markers can outlive it.
+"""
+
+import importlib.util
+import multiprocessing
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+
+from tqdm import tqdm
+
+from .work import SlurmConfig, Work, WorkerDied
+
+EXECUTORS = ("local", "slurm", "ray")
+
+
+def check_executor(executor: str, slurm: SlurmConfig) -> None:
+    """Raises ValueError if an executor is unknown or cannot run here."""
+    if executor not in EXECUTORS:
+        raise ValueError(f"--executor is one of {', '.join(EXECUTORS)}, got {executor!r}")
+    if executor == "slurm" and (shutil.which("sbatch") is None or not slurm.partition):
+        raise ValueError("--executor=slurm needs Slurm's sbatch on the PATH, and --slurm.partition=NAME")
+    if executor == "ray" and importlib.util.find_spec("ray") is None:
+        raise ValueError("--executor=ray needs Ray: pip install 'lerobot_policy_lansar[ray]'")
+
+
+def run_shards(
+    work: Work,
+    shards: int,
+    finish: Work,
+    *,
+    executor: str,
+    workers: int,
+    slurm: SlurmConfig,
+    logging_dir: Path,
+    progress: Callable[[], int],
+    total: int,
+    unit: str,
+    desc: str = "recording",
+) -> bool:
+    """Calls `work` for every shard and `finish` once after them.
+
+    Args:
+        work: Called for every shard, also for those that an earlier call finished.
+        shards: How many there are.
+        finish: Called with a number too, 0.
+        executor: One of `EXECUTORS`.
+        workers: Processes at a time; with Slurm the array's limit of tasks at a time.
+        slurm: Used by the executor of that name.
+        logging_dir: Where Slurm's and Ray's logs are kept.
+        progress: How many of `total` units are done, for the progress bar.
+        total, unit, desc: Of the bar.
+
+    Returns:
+        Whether all is done; False when jobs were submitted that go on without this process.
+
+    Raises:
+        WorkerDied: A worker was killed; the same call goes on where it stopped.
+        subprocess.CalledProcessError: Slurm refused a job; those it had taken are cancelled.
+        Exception: Whatever `work` or `finish` raised.
+    """
+    if executor != "local":
+        from . import cluster  # datatrove takes a second to import
+
+        if executor == "slurm":
+            cluster.submit_to_slurm(work, shards, finish, workers, slurm, logging_dir)
+            return False
+    with _progress_bar(progress, total, unit, desc):
+        if executor == "ray":
+            cluster.run_on_ray(work, shards, workers, logging_dir)
+        else:
+            _run_here(work, shards, workers)
+    function, arguments = finish
+    function(*arguments, 0)
+    return True
+
+
+def _run_here(work: Work, shards: int, workers: int) -> None:
+    """All shards in processes of this machine; a single worker is this process."""
+    function, arguments = work
+    if workers == 1:
+        for shard in range(shards):
+            function(*arguments, shard)
+        return
+    others = set(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, initializer=_prepare_worker)
+    try:
+        futures = [pool.submit(function, *arguments, shard) for shard in range(shards)]
+        wait(futures, return_when=FIRST_EXCEPTION)
+        for future in futures:
+            if future.done():
+                future.result()
+    except BaseException as error:  # whatever the other workers are doing would hold us up
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        if isinstance(error, BrokenProcessPool):
+            raise WorkerDied(
+                "a worker process was killed (out of memory?); run the same command again to go on"
+            ) from None
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _prepare_worker() -> None:
+    """Ctrl-C reaches a terminal's whole process group: ending the workers is the main process' part. They end on
+    their own when it was killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+@contextmanager
+def _progress_bar(progress: Callable[[], int], total: int, unit: str, desc: str) -> Iterator[None]:
+    ended = threading.Event()
+
+    def watch() -> None:
+        with tqdm(total=total, initial=progress(), desc=desc, unit=unit) as bar:
+            while not ended.wait(0.5):
+                bar.update(progress() - bar.n)
+            bar.update(progress() - bar.n)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

@@ -1,0 +1,95 @@
+"""Output folders that appear complete or not at all, and work on them that goes on where it stopped."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+_LOCK, _REQUEST, _SUBMITTED = "lock", "request.json", "submitted"
+_PATIENCE = 3.0  # s; long enough for the workers of a killed run to notice and go
+
+
+def write_atomically(file: Path, text: str) -> None:
+    """Writes a file that is complete whenever it is there."""
+    partial = file.with_name(file.name + ".partial")
+    partial.write_text(text)
+    partial.rename(file)
+
+
+@contextmanager
+def staging(
+    folder: Path,
+    target: Path,
+    request: dict[str, Any],
+    has_results: Callable[[Path], bool],
+    submitting: bool = False,
+) -> Iterator[None]:
+    """Makes `folder` the place where `target` is prepared: new, or as an interrupted run of the request left it.
+
+    A lock that dies with its process keeps two runs from sharing it. If the block raises, nothing counts as submitted,
+    and a folder without any result is removed.
+
+    Args:
+        folder: Where to prepare.
+        target: What will appear, for messages.
+        request: Everything that decides the result; JSON.
+        has_results: Whether the folder holds anything worth keeping.
+        submitting: The block hands the work to jobs that write into the folder after it.
+
+    Raises:
+        ValueError: Another process or jobs are writing, or the folder holds results of another request.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / _LOCK, timeout=_PATIENCE):
+            _claim(folder, target, json.loads(json.dumps(request)), has_results)
+            if submitting:
+                (folder / _SUBMITTED).touch()
+            try:
+                yield
+            except BaseException:
+                (folder / _SUBMITTED).unlink(missing_ok=True)
+                if not has_results(folder):
+                    shutil.rmtree(folder, ignore_errors=True)
+                raise
+    except Timeout:
+        raise ValueError(f"another process is writing {target}: wait for it or stop it") from None
+
+
+def publish(folder: Path, result: Path, target: Path) -> None:
+    """Renames `result`, the finished part of a staging folder, to its place and removes the rest."""
+    (folder / _SUBMITTED).unlink(missing_ok=True)  # first: a process killed below leaves nothing that is waited for
+    result.rename(target)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def refuse_submitted(folder: Path, target: Path) -> None:
+    """Raises ValueError if jobs that were submitted are still to write into a staging folder."""
+    if (folder / _SUBMITTED).exists():
+        raise ValueError(
+            f"Slurm jobs for {target} were submitted already: wait for them, or cancel them and delete "
+            f"{folder / _SUBMITTED} to submit what is missing"
+        )
+
+
+def _claim(folder: Path, target: Path, request: dict[str, Any], has_results: Callable[[Path], bool]) -> None:
+    refuse_submitted(folder, target)
+    file = folder / _REQUEST
+    # Without its request nothing tells what the results are.
+    if not (file.exists() and has_results(folder)):
+        _remove(path for path in folder.iterdir() if path.name != _LOCK)
+        write_atomically(file, json.dumps(request, indent=1) + "\n")
+    elif json.loads(file.read_text()) != request:
+        raise ValueError(
+            f"{folder} holds work that was begun with other options: repeat those of {file}, or delete that folder"
+        )
+    _remove(folder.glob("*.partial"))  # of processes that were killed
+
+
+def _remove(paths: Iterator[Path]) -> None:
+    for path in list(paths):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
