@@ -1,7 +1,7 @@
 """`lerobot`: one command in front of LeRobot's own, with `key=value` options.
 
-LeRobot 0.6 installs `lerobot-train`, `lerobot-eval`, … but no `lerobot`. This one only rewrites the
-options and hands over.
+LeRobot 0.6 installs `lerobot-train`, `lerobot-eval`, … but no `lerobot`. This one only rewrites the options, then
+becomes LeRobot's command.
 """
 
 import os
@@ -9,9 +9,11 @@ import sys
 import sysconfig
 from pathlib import Path
 
+from .command import CommandError, run_command
+
 HELP = """usage: lerobot COMMAND [key=value ...] [--option=value ...]
 
-Runs LeRobot's own lerobot-COMMAND: key=value becomes --key=value, and what starts with - is passed on.
+Runs LeRobot's own lerobot-COMMAND: key=value becomes --key=value; what starts with - is passed on unchanged.
 
     lerobot train policy=lansar dataset.repo_id=you/desk_D policy.use_images=false steps=3000
     lerobot eval policy=outputs/train/checkpoints/last/pretrained_model env=calvin env.control_mode=abs seed=0
@@ -38,7 +40,7 @@ def translate(command: str, arguments: list[str]) -> list[str]:
         The arguments of `lerobot-<command>`.
 
     Raises:
-        ValueError: An argument is neither an option nor `key=value`.
+        CommandError: An argument is neither an option nor `key=value`.
     """
     translated = []
     for position, argument in enumerate(arguments):
@@ -49,7 +51,7 @@ def translate(command: str, arguments: list[str]) -> list[str]:
         if argument.startswith("-") or (follows_option and not equals):
             translated.append(argument)
         elif not equals:
-            raise ValueError(f"{argument!r} is neither key=value nor an option; see `lerobot {command} --help`")
+            raise CommandError(f"{argument!r} is neither key=value nor an option; see `lerobot {command} --help`")
         elif key == "policy":
             # A checkpoint is a folder or user/model on the hub; only training makes a policy from its name.
             is_checkpoint = command == "eval" or "/" in value or Path(value).exists()
@@ -61,21 +63,27 @@ def translate(command: str, arguments: list[str]) -> list[str]:
     return translated
 
 
-def main() -> int:
-    """Replaces this process by LeRobot's command; returns 2 after an error, 0 after help."""
+def run() -> None:
+    """Prints the help, or replaces this process by LeRobot's command.
+
+    Raises:
+        CommandError: LeRobot has no such command, or an argument cannot be translated.
+        OSError: The command could not be started.
+    """
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
         print(HELP)
         print("Commands: " + ", ".join(commands()))
-        return 0
+        return
     word, arguments = sys.argv[1], sys.argv[2:]
-    try:
-        if word not in commands():
-            raise ValueError(f"there is no lerobot-{word} here; commands: {', '.join(commands())}")
-        script = str(commands()[word])
-        os.execv(script, [script, *translate(word, arguments)])
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-    return 2
+    if word not in commands():
+        raise CommandError(f"there is no lerobot-{word} here; commands: {', '.join(commands())}")
+    script = str(commands()[word])
+    os.execv(script, [script, *translate(word, arguments)])
+
+
+def main() -> int:
+    """Entry point of `lerobot`."""
+    return run_command("lerobot", run)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What all `lansar-…` commands do alike: error messages, exit codes, Ctrl-C."""
+"""What all commands of this package share: error messages, exit codes, Ctrl-C."""
 
 import shlex
 import subprocess
@@ -9,24 +9,24 @@ from draccus.utils import DraccusException
 
 
 class CommandError(Exception):
-    """Something went wrong that the user can mend; the message says what and how."""
+    """An error that the user can fix; the message says what is wrong and what to do."""
 
 
 def run_command(name: str, function: Callable[[], int | None], resumable: bool = False) -> int:
-    """Runs a command and turns what a user can mend into one line on the standard error stream.
+    """Runs a command; an error that the user can fix becomes one message on the standard error stream.
 
     Args:
-        name: The command's, with which its messages begin.
-        function: Reads its options from `sys.argv`, as a function wrapped by `draccus.wrap` does.
-        resumable: The same command goes on where it was interrupted.
+        name: Name of the command; its messages begin with it.
+        function: Does the work and reads its options from `sys.argv`, as a function wrapped by `draccus.wrap` does.
+        resumable: Whether the same command goes on where it was interrupted.
 
     Returns:
-        The exit code: what `function` returned (None is 0), 2 after an error, 130 after Ctrl-C.
+        The exit code: what `function` returned (None counts as 0), 2 after an error, 130 after Ctrl-C.
     """
     try:
         return function() or 0
     except subprocess.CalledProcessError as error:
-        message = f"{shlex.join(map(str, error.cmd))} failed: {error.stderr or error}"
+        message = _describe(error)
     except (OSError, ValueError, CommandError, DraccusException) as error:
         message = str(error)
     except KeyboardInterrupt:
@@ -35,3 +35,10 @@ def run_command(name: str, function: Callable[[], int | None], resumable: bool =
         return 130
     print(f"{name}: error: {message}", file=sys.stderr)
     return 2
+
+
+def _describe(error: subprocess.CalledProcessError) -> str:
+    """The command line as typed in a shell, its exit code, and its own message where that was captured."""
+    line = error.cmd if isinstance(error.cmd, str) else shlex.join(map(str, error.cmd))
+    said = error.stderr.decode(errors="replace") if isinstance(error.stderr, bytes) else error.stderr
+    return f"`{line}` failed with exit code {error.returncode}" + (f": {said.strip()}" if said else "")

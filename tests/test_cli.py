@@ -65,7 +65,9 @@ def test_the_real_command_replaces_this_process(monkeypatch):
 def test_a_mistake_is_explained_with_exit_code_2(monkeypatch, capsys, arguments, message):
     monkeypatch.setattr(sys, "argv", ["lerobot", *arguments])
     assert cli.main() == 2
-    assert message in capsys.readouterr().err
+    printed = capsys.readouterr().err
+    assert printed.startswith("lerobot: error: ")
+    assert message in printed
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])

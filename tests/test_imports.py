@@ -1,6 +1,6 @@
-"""The floors of the house: imports point downwards only, and never run in a circle.
+"""Rooms lie on floors: imports point downwards only, and never run in a circle.
 
-Imports are read from the source, late ones inside functions included; those for type checkers alone do not count.
+Imports are read from the source, also those inside functions; imports for type checkers do not count.
 """
 
 import ast
@@ -16,17 +16,18 @@ FLOORS = [
     ("lerobot_lansar.demos", "lerobot_lansar.envs"),
     ("lerobot_lansar.attention", "lerobot_lansar.cli", "lerobot_policy_lansar", "benchmarks", "scripts"),
 ]
-"""From the ground up. Rooms of one floor do not know each other either, but for those on the ground."""
+"""From the ground up. Rooms of one floor do not import each other, except on the ground and at the top."""
 
 
 def modules():
+    """Every module of ours by name, with its file."""
     folders = ("lerobot_lansar", "dataset_convert", "benchmarks", "scripts")
     files = [ROOT / "lerobot_policy_lansar.py", *(f for folder in folders for f in (ROOT / folder).rglob("*.py"))]
     return {".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
 
 
 def imports(name, file, known):
-    """Names of our modules that a file imports."""
+    """Which of our modules a file imports, by name."""
     package = name if file.name == "__init__.py" else name.rpartition(".")[0]
     tree = ast.parse(file.read_text())
     for node in ast.walk(tree):
@@ -44,6 +45,7 @@ def imports(name, file, known):
 
 
 def floor_and_room(name):
+    """The number of a module's floor and the room that it belongs to, or None."""
     for number, rooms in enumerate(FLOORS):
         for room in rooms:
             if name == room or name.startswith(room + "."):
@@ -52,12 +54,18 @@ def floor_and_room(name):
 
 
 def graph():
+    """Every module of ours to those that it imports."""
     found = modules()
     return {name: imports(name, file, set(found)) for name, file in found.items()}
 
 
 def test_every_module_has_a_floor():
     assert [name for name in graph() if name != "lerobot_lansar" and floor_and_room(name) is None] == []
+
+
+def test_the_package_itself_imports_no_room():
+    # It runs before any of them: whatever it imported, every room would load.
+    assert graph()["lerobot_lansar"] == set()
 
 
 def test_imports_point_downwards():
@@ -72,6 +80,6 @@ def test_imports_point_downwards():
 
 
 def test_imports_never_run_in_a_circle():
-    # A module and the packages that it lies in are one: `from . import` means a neighbour.
+    # A module's own package does not count: `from . import name` imports a neighbour.
     known = {name: {o for o in used if not name.startswith(o + ".")} for name, used in graph().items()}
     assert len(list(TopologicalSorter(known).static_order())) > 60  # raises CycleError

@@ -6,6 +6,8 @@ import sys
 from importlib.metadata import entry_points, metadata
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -15,24 +17,25 @@ def test_distribution_name_is_the_one_lerobot_looks_for():
 
 
 def test_every_command_is_installed():
+    words = ("record", "play", "convert", "embed", "verify", "report", "attention")
     commands = {entry.name: entry for entry in entry_points(group="console_scripts")}
-    for name in ("lansar-record", "lansar-convert", "lansar-report", "lerobot"):
+    for name in ("lerobot", *(f"lansar-{word}" for word in words)):
         assert callable(commands[name].load())
 
 
-def test_the_desk_needs_neither_lerobot_nor_torch():
-    code = "import sys, lerobot_lansar.desk; print([m for m in ('lerobot', 'torch') if m in sys.modules])"
+@pytest.mark.parametrize(
+    ("module", "libraries"),
+    [
+        ("lerobot_lansar.desk", ["lerobot", "torch"]),
+        ("lerobot_lansar.envs.calvin", ["lerobot", "torch"]),
+        ("lerobot_lansar.report.report", ["lerobot", "torch", "pybullet"]),
+        ("lerobot_lansar.policy.modeling_lansar", ["pybullet"]),
+    ],
+)
+def test_a_room_loads_no_library_that_only_others_need(module, libraries):
+    code = f"import sys, {module}; print([name for name in {libraries} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("[]")
-
-
-def test_policy_and_desk_never_meet():
-    code = (
-        "import sys, lerobot_lansar.policy.modeling_lansar; "
-        "print('pybullet' in sys.modules, any(m.startswith('lerobot_lansar.desk') for m in sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip().endswith("False False")
 
 
 def test_lerobots_own_discovery_registers_policy_and_environment():

@@ -1,4 +1,8 @@
-"""CALVIN's long-horizon benchmark (LH-MTLC), frozen: 1000 chains of five tasks from 192 initial states of scene D."""
+"""CALVIN's long-horizon benchmark (LH-MTLC), frozen: 1000 chains of five tasks from 192 initial states of scene D.
+
+chains.json           the chains, in the benchmark's order
+initial_states.json   the robot's initial state and the scene's 192
+"""
 
 import json
 from dataclasses import dataclass
@@ -8,7 +12,10 @@ from importlib import resources
 import numpy as np
 
 LH_MTLC = "lh_mtlc"
-"""The name under which the benchmark is asked for."""
+"""The benchmark's name among the environment's tasks."""
+
+EPISODES_FILE = "episodes.jsonl"
+"""File in an evaluation's results folder: the environment adds a line per finished episode, the report reads them."""
 
 
 @dataclass(frozen=True)
