@@ -1,5 +1,5 @@
-# Two commands: `make quickstart` and `make test`. Each sets up what it needs; a second run is quick.
-#   PYTHON=/path/to/python3.12   chooses the interpreter when the search does not find the one you want
+# Two commands: `make quickstart` and `make test`. Each first sets up what it needs; later runs skip that.
+#   make PYTHON=/path/to/python3.12 …   uses this interpreter instead of the first one found
 
 .PHONY: help install quickstart test lint benchmarks clean
 
@@ -8,7 +8,8 @@ help:
 	@echo "make test         environment, all tests"
 	@echo "make install      environment only: .venv with the plugin installed editable"
 	@echo "make lint         ruff and mypy"
-	@echo "make benchmarks   the speed tables of docs/benchmarks.md; ASSETS=DIR for those on CALVIN's files too"
+	@echo "make benchmarks   the speed tables of docs/benchmarks.md; with ASSETS=DIR also those on CALVIN's files"
+	@echo "make clean        removes .venv, outputs and data/quickstart"
 
 install: .venv/.installed
 
