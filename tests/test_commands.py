@@ -1,4 +1,4 @@
-"""The whole line as a user types it: record, convert, train, evaluate, report. Real commands, few steps."""
+"""All commands as a user types them: record, convert, train, evaluate, report; few steps each."""
 
 import json
 import os
@@ -114,12 +114,12 @@ def test_lansar_evaluates_the_same_with_any_batch_size(run, work, lansar):
     assert successes(work, "eval1") == successes(work, "eval3")
     assert len(successes(work, "eval1")[0]) == 4
     episodes = [
-        {json.loads(line)["seed"]: json.loads(line)["commands"] for f in (work / d).iterdir() for line in f.open()}
+        {json.loads(line)["seed"]: json.loads(line)["commands"] for line in (work / d / "episodes.jsonl").open()}
         for d in ("results1", "results3")
     ]
     assert all(episodes[0][seed] == episodes[1][seed] for seed in range(4))
-    # The motion itself, seen through the videos. Products of different batch sizes round differently, contact makes
-    # that grow, and the encoder looks ahead: equal to the eye, not to the bit. Different episodes differ by over 10.
+    # The motion itself, seen in the videos. Batch sizes round differently, contact amplifies the difference, and the
+    # video encoder looks ahead: the films are equal to the eye, not to the bit. Different episodes differ by over 10.
     films = [[film(work / f"eval{size}", k) for k in range(4)] for size in (1, 3)]
     for one, three in zip(*films, strict=True):
         assert one.shape == three.shape

@@ -1,1 +1,6 @@
-"""Tables and plots from what `lerobot-eval` wrote, and what a LanSAR attends to in a rollout (`attention.py`)."""
+"""Success rates of an evaluation on the CALVIN desk. Reads files only: no simulation, no policy, no LeRobot.
+
+report      `lansar-report`: report.json, report.md and the plots
+results     `eval_info.json` and `episodes.jsonl` to episodes, and episodes to success rates
+plots       the plots
+"""

@@ -1,4 +1,4 @@
-"""The report's pictures."""
+"""The report's plots."""
 
 from pathlib import Path
 from typing import Any

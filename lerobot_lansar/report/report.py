@@ -9,23 +9,24 @@ from typing import Any
 
 import draccus
 
-from lerobot_lansar.command import run_command
-from lerobot_lansar.report.results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
+from ..benchmark import EPISODES_FILE, load_chains
+from ..command import run_command
+from .results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
 
 
 @dataclass
 class ReportConfig:
     """Success rates of one evaluation on the CALVIN desk, printed and saved with two plots."""
 
-    # --output_dir of the lerobot-eval run: it holds eval_info.json
+    # --output_dir of the lerobot-eval run: the folder of eval_info.json
     eval_dir: Path
     # where to write report.json, report.md and the plots; eval_dir by default
     output_dir: Path | None = None
-    # --env.results_dir of that run, with episodes-*.jsonl; eval_dir by default
+    # --env.results_dir of that run, the folder of episodes.jsonl; eval_dir by default
     results_dir: Path | None = None
-    # --seed of that run; by default the smallest seed in episodes-*.jsonl, or LeRobot's default, 1000
+    # --seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000
     seed: int | None = None
-    # --policy.path of that run, to state whether the policy reads the simulator's own state
+    # --policy.path of that run; the report then states whether the policy reads the simulator's own state
     policy_path: Path | None = None
 
 
@@ -36,28 +37,28 @@ def report(config: ReportConfig) -> dict[str, Any]:
         config: The command's options.
 
     Returns:
-        What `report.json` holds: the figures of `summarise`, notes and the package's version.
+        The content of `report.json`: what `summarise` returns, notes and the package's version.
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: A file is malformed, or the files are not of one evaluation.
+        ValueError: A file is malformed, or the files are of different evaluations.
     """
     results_dir = config.results_dir or config.eval_dir
     if not results_dir.is_dir():
         raise FileNotFoundError(f"--results_dir={results_dir} is not a folder")
     entries, lines = read_eval_info(config.eval_dir), read_lines(results_dir)
     if config.results_dir and not lines:
-        raise FileNotFoundError(f"--results_dir={results_dir} holds no episodes-*.jsonl")
+        raise FileNotFoundError(f"--results_dir={results_dir} holds no {EPISODES_FILE}")
     summary = summarise(collect(entries, lines, config.seed))
     summary["policy_reads_scene_state"] = _reads_scene_state(config.policy_path)
-    summary["notes"] = _notes(summary, named=config.seed is not None or bool(lines))
+    summary["notes"] = _notes(summary, chains_known=config.seed is not None or bool(lines))
     summary["lerobot_policy_lansar"] = version("lerobot_policy_lansar")
 
     output_dir = config.output_dir or config.eval_dir
     output_dir.mkdir(parents=True, exist_ok=True)
     (output_dir / "report.json").write_text(json.dumps(summary, indent=2) + "\n")
     (output_dir / "report.md").write_text(as_markdown(summary))
-    from lerobot_lansar.report.plots import plot_in_a_row, plot_tasks
+    from .plots import plot_in_a_row, plot_tasks  # matplotlib takes a second to import
 
     plot_tasks(summary, output_dir / "tasks.png")
     if "in_a_row" in summary:
@@ -72,29 +73,29 @@ def _reads_scene_state(policy_path: Path | None) -> bool | None:
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: --policy_path must be a pretrained_model folder")
     policy = json.loads(path.read_text())
-    # LanSAR can leave the scene out of its network although the data have it.
+    # LanSAR may ignore the scene state although its inputs include it.
     is_used = policy.get("use_spatial_context", True)
     return is_used and "observation.environment_state" in (policy.get("input_features") or {})
 
 
-def _notes(summary: dict[str, Any], named: bool) -> list[str]:
-    """What a reader must know; `named` is whether the chains are known or only supposed."""
+def _notes(summary: dict[str, Any], chains_known: bool) -> list[str]:
+    """What a reader must know; without `chains_known`, the chains follow from LeRobot's default seed."""
     notes = []
     assets = summary["settings"]["assets"]
     if assets != "original":
         desk = "the built-in desk" if assets == "built-in" else "a desk that the files do not name"
         notes.append(f"Measured on {desk}: not comparable with published CALVIN numbers.")
     if summary["policy_reads_scene_state"]:
-        notes.append("The policy reads the simulator's own scene state (privileged), which a real robot has not.")
+        notes.append("The policy reads the simulator's own scene state (privileged), which a real robot does not have.")
     elif summary["policy_reads_scene_state"] is None:
         notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
-    if "in_a_row" in summary and not named:
+    if "in_a_row" in summary and not chains_known:
         notes.append(
-            f"Nothing says which chains these are: success per task is right only if --seed was {DEFAULT_SEED}, "
-            "LeRobot's default. Give lansar-report the --seed of the evaluation."
+            "The files do not say which chains these are: success per task is right only if --seed was "
+            f"{DEFAULT_SEED}, LeRobot's default. Give lansar-report the --seed of the evaluation."
         )
-    if "in_a_row" in summary and summary["episodes"] < 1000:
-        notes.append(f"{summary['episodes']} of the benchmark's 1000 chains.")
+    if "in_a_row" in summary and summary["episodes"] < len(load_chains()):
+        notes.append(f"{summary['episodes']} of the benchmark's {len(load_chains())} chains.")
     return notes
 
 
@@ -132,7 +133,7 @@ def as_markdown(summary: dict[str, Any]) -> str:
 
 @draccus.wrap()
 def run(config: ReportConfig) -> None:
-    """Reports, prints the report and says where it is."""
+    """Writes the report, prints it and says where it is."""
     print(as_markdown(report(config)))
     print(f"report.json, report.md and the plots are in {config.output_dir or config.eval_dir}")
 

@@ -1,9 +1,8 @@
-"""From what `lerobot-eval` leaves behind to success rates.
+"""From the files of an evaluation to success rates.
 
-`eval_info.json` is enough: an episode's sum of rewards is the number of commands it fulfilled in a row, and
-which chain it ran follows from its seed. Where the environment also wrote `episodes-*.jsonl`
-(`--env.results_dir`), those lines tell which commands were attempted, under which settings, and are held
-against `eval_info.json`.
+LeRobot's `eval_info.json` is enough: an episode's sum of rewards is the number of commands that it fulfilled in a row,
+and its chain follows from its seed. If the environment wrote `episodes.jsonl` too (`--env.results_dir`), those lines
+tell which commands were attempted and under which settings, and are checked against `eval_info.json`.
 """
 
 import json
@@ -12,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..benchmark import LH_MTLC, load_chains
+from ..benchmark import EPISODES_FILE, LH_MTLC, load_chains
 from ..calvin import CHAIN_LENGTH, TASKS
 
 DEFAULT_SEED = 1000
@@ -27,7 +26,7 @@ SETTINGS = (
     "perturbation_every",
     "perturbation_scale",
 )
-"""What an episode's line may say about how it was run."""
+"""Entries of an episode's line that say how it was run; older lines may lack some."""
 
 
 @dataclass
@@ -35,10 +34,10 @@ class Episode:
     """The commands one episode attempted, in order.
 
     Attributes:
-        commands: (task name, fulfilled) of each; all but the last are fulfilled.
+        commands: (task name, whether it was fulfilled) of each; all but the last were.
         seed: The episode's reset seed.
         chain: Number of the chain, or None for a single task.
-        settings: Those of `SETTINGS` that are known.
+        settings: The known ones of `SETTINGS`.
     """
 
     commands: list[tuple[str, bool]]
@@ -48,7 +47,7 @@ class Episode:
 
     @property
     def successes(self) -> int:
-        """How many commands it fulfilled."""
+        """How many commands were fulfilled."""
         return sum(fulfilled for _, fulfilled in self.commands)
 
 
@@ -59,8 +58,8 @@ def read_eval_info(eval_dir: Path) -> list[dict[str, Any]]:
         [{"task_group": str, "sum_rewards": [number per episode]}].
 
     Raises:
-        FileNotFoundError: The evaluation has not finished or is elsewhere.
-        ValueError: It is not LeRobot's file.
+        FileNotFoundError: The evaluation has not finished, or its folder is another one.
+        ValueError: The file is not LeRobot's, or holds no episode.
     """
     path = eval_dir / "eval_info.json"
     if not path.is_file():
@@ -82,77 +81,81 @@ def read_eval_info(eval_dir: Path) -> list[dict[str, Any]]:
 
 
 def read_lines(folder: Path) -> list[Episode]:
-    """Reads the environment's own lines, `episodes-*.jsonl`; empty if there are none.
+    """Reads the environment's own lines, `episodes.jsonl`; empty if there is no such file.
 
     Raises:
         ValueError: A line is not what the environment writes.
     """
+    path = folder / EPISODES_FILE
+    if not path.is_file():
+        return []
     episodes = []
-    for path in sorted(folder.glob("episodes-*.jsonl")):
-        for number, line in enumerate(path.read_text().splitlines(), start=1):
-            try:
-                stored = json.loads(line)
-                commands = [(command["task"], bool(command["success"])) for command in stored["commands"]]
-                if not commands:
-                    raise ValueError("no command")
-                episodes.append(
-                    Episode(
-                        commands=commands,
-                        seed=int(stored["seed"]),
-                        chain=stored["chain"],
-                        settings={key: stored[key] for key in SETTINGS if key in stored},
-                    )
-                )
-            except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(
-                    f"{path}, line {number}: not an episode of the CALVIN environment ({error!r})"
-                ) from error
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            episodes.append(_from_line(json.loads(line)))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}, line {number}: not an episode of the CALVIN environment ({error!r})") from error
     return episodes
+
+
+def _from_line(line: dict[str, Any]) -> Episode:
+    commands = [(command["task"], bool(command["success"])) for command in line["commands"]]
+    if not commands:
+        raise ValueError("no command")
+    settings = {key: line[key] for key in SETTINGS if key in line}
+    return Episode(commands, int(line["seed"]), line["chain"], settings)
 
 
 def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | None) -> list[Episode]:
     """Brings both sources together.
 
     Args:
-        entries: Of `read_eval_info`.
-        lines: Of `read_lines`; they may hold more episodes than counted, as the last batch is full.
+        entries: What `read_eval_info` returned.
+        lines: What `read_lines` returned. There may be more than LeRobot counts, since its last batch is full.
         seed: The evaluation's `--seed`; None: the smallest one in the lines, or LeRobot's default.
 
     Returns:
-        The counted episodes.
+        The episodes that LeRobot counts.
 
     Raises:
-        ValueError: The sources contradict each other, or something cannot be told without the lines.
+        ValueError: The sources contradict each other, or `eval_info.json` is of another environment.
     """
     episodes = []
     for entry in entries:
         group = entry["task_group"]
         task = group if group in TASKS else None
-        # One task per entry, or one entry for all lines: chains, or a single task in a group of another name.
-        own = [line for line in lines if task is None or (line.chain is None and line.commands[0][0] == task)]
-        if group == LH_MTLC:
-            own = [line for line in own if line.chain is not None]
-        first = seed if seed is not None else min((line.seed for line in own), default=DEFAULT_SEED)
+        own = _lines_of(group, lines)
         by_seed: dict[int, Episode] = {}
         for line in own:
             if by_seed.setdefault(line.seed, line) != line:
                 raise ValueError(
-                    f"the episodes-*.jsonl files hold two different episodes of seed {line.seed}: they are "
-                    "of several evaluations; give each evaluation its own --env.results_dir"
+                    f"{EPISODES_FILE} holds two different episodes of seed {line.seed}, so it is of several "
+                    "evaluations; give each evaluation its own --env.results_dir"
                 )
+        first = seed if seed is not None else min(by_seed, default=DEFAULT_SEED)
         for k, rewards in enumerate(entry["sum_rewards"]):
             episode = by_seed.get(first + k) if own else _from_reward(rewards, first + k, task)
             if episode is None or episode.successes != rewards:
-                found = "no line" if episode is None else f"{episode.successes}"
+                found = "has no line for it" if episode is None else f"says {episode.successes}"
                 raise ValueError(
                     f"episode {k} (seed {first + k}) fulfilled {rewards:g} commands in eval_info.json, but "
-                    f"episodes-*.jsonl say {found}: they are of another evaluation, or --seed is wrong"
+                    f"{EPISODES_FILE} {found}: it is of another evaluation, or --seed is wrong"
                 )
             episodes.append(episode)
     return episodes
 
 
+def _lines_of(group: str, lines: list[Episode]) -> list[Episode]:
+    """The lines of a task group: of a single task, of the chains, or all of them if the group has another name."""
+    if group in TASKS:
+        return [line for line in lines if line.chain is None and line.commands[0][0] == group]
+    if group == LH_MTLC:
+        return [line for line in lines if line.chain is not None]
+    return lines
+
+
 def _from_reward(rewards: float, seed: int, task: str | None) -> Episode:
+    """An episode of a single task, or of the chain that follows from the seed if `task` is None."""
     fulfilled = int(rewards)
     if fulfilled != rewards or not 0 <= fulfilled <= (CHAIN_LENGTH if task is None else 1):
         raise ValueError(f"sum of rewards {rewards} in eval_info.json: not an evaluation of the CALVIN environment")
@@ -170,7 +173,8 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
     Returns:
         {"episodes", "seeds": [first, last], "settings", "tasks": {task: {"successes", "attempts", "rate"}},
         "local_success_rate"} and, for chains, {"in_a_row": [share with at least 1…5], "average_length"}. The
-        average length is the sum of the five shares; the local success rate is that over attempted commands.
+        average length is the sum of the five shares; the local success rate is the share of attempted commands
+        that were fulfilled.
     """
     tasks: dict[str, dict[str, Any]] = {}
     for name, fulfilled in (command for episode in episodes for command in episode.commands):
@@ -194,5 +198,6 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
 
 
 def _agreed(values: Iterable[Any]) -> Any:
+    """The value that all agree on, the sorted list of different ones, or None if all are None."""
     distinct = {value for value in values if value is not None}
     return distinct.pop() if len(distinct) == 1 else sorted(distinct) or None

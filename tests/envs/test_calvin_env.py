@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import lerobot_lansar  # noqa: F401  (registers the environment)
-from lerobot_lansar.benchmark import load_chains
+from lerobot_lansar.benchmark import EPISODES_FILE, load_chains
 from lerobot_lansar.calvin import TASKS
 from lerobot_lansar.demos.motion import Motion
 from lerobot_lansar.demos.moves import View
@@ -21,7 +21,7 @@ NOTHING = np.array([0, 0, 0, 0, 0, 0, 1.0])
 
 
 def script(env, obs, tasks, seed=0):
-    """Carries out `tasks` one after the other with the demonstrator's skills; yields what each step returned."""
+    """Carries out `tasks` in turn with the demonstrator's skills; yields what each step returned."""
     for task in tasks:
         state = obs["agent_pos"], obs["environment_state"][:24]
         view = View(env.unwrapped._desk.scene, *state, np.random.default_rng(seed))
@@ -90,8 +90,8 @@ def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_pat
         steps += 1
     assert steps == 200
     assert reward == 0
-    (file,) = tmp_path.iterdir()
-    episode = json.loads(file.read_text())
+    (line,) = (tmp_path / EPISODES_FILE).read_text().splitlines()
+    episode = json.loads(line)
     assert episode["chain"] == chain
     assert episode["successes"] == 2
     assert [c["success"] for c in episode["commands"]] == [True, True, False]
@@ -138,7 +138,7 @@ def test_actions_of_the_other_control_mode_are_refused_at_once():
     env.close()
 
 
-def test_a_diverged_episode_fails_and_the_next_one_is_as_ever():
+def test_a_diverged_episode_fails_and_the_next_one_is_unaffected():
     env = CalvinEnv("turn_on_led", cameras=())
     first, _ = env.reset(seed=3)
     env.render()
@@ -165,7 +165,7 @@ def test_an_episode_that_ended_cannot_be_stepped_on():
 
 
 @pytest.mark.parametrize("mode", ["rel", "abs"])
-def test_every_kth_action_is_disturbed_as_equation_4_9_says(mode, monkeypatch):
+def test_every_kth_action_is_perturbed_as_equation_4_9_says(mode, monkeypatch):
     options = {"control_mode": mode, "perturbation_every": 3, "perturbation_scale": 5.0}
     env = CalvinEnv("open_drawer", cameras=(), **options)
     obs, _ = env.reset(seed=1)
@@ -195,7 +195,7 @@ def test_every_kth_action_is_disturbed_as_equation_4_9_says(mode, monkeypatch):
     env.close()
 
 
-def test_disturbances_depend_on_the_seed_alone():
+def test_perturbations_depend_on_the_seed_alone():
     draws = []
     for seed in (4, 4, 5):
         env = CalvinEnv("open_drawer", cameras=(), perturbation_every=1, perturbation_scale=1.0)
@@ -205,7 +205,7 @@ def test_disturbances_depend_on_the_seed_alone():
     assert draws[0] == draws[1] != draws[2]
 
 
-def test_pictures_are_drawn_at_the_rate_asked_for():
+def test_pictures_are_drawn_at_render_fps():
     env = CalvinEnv("open_drawer", cameras=(), render_fps=10)
     env.reset(seed=0)
     pictures = [env.render()]

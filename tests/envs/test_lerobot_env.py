@@ -1,7 +1,15 @@
-"""`--env.type=calvin`: what LeRobot's evaluation gets to see."""
+"""`--env.type=calvin`: options, features and vector environments as LeRobot's evaluation uses them."""
 
+import inspect
+import io
+import json
+from contextlib import redirect_stdout
+from dataclasses import fields
+
+import draccus
 import numpy as np
 import pytest
+from draccus.wrappers.docstring import get_attribute_docstring
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -9,6 +17,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 import lerobot_policy_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.desk import DeskError
 from lerobot_lansar.desk.sentences import COMMANDS
+from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 
 
@@ -30,13 +39,34 @@ def test_features_follow_the_cameras():
         CalvinEnvConfig(cameras=["wrist"])
 
 
+def test_every_option_of_the_desk_is_explained_by_help():
+    inherited = {field.name for field in fields(EnvConfig)}
+    own = {field.name for field in fields(CalvinEnvConfig)} - inherited | {"task", "fps"}
+    explained = {name for name in own if get_attribute_docstring(CalvinEnvConfig, name).comment_above}
+    assert explained == own
+    assert len(own) == 14
+    text = io.StringIO()
+    with pytest.raises(SystemExit), redirect_stdout(text):
+        draccus.parse(CalvinEnvConfig, args=["--help"])
+    assert "environment_state, 1 for the commanded task" in " ".join(text.getvalue().split())
+
+
+def test_every_argument_of_the_environment_is_an_option():
+    options = CalvinEnvConfig(steps_per_command=7, render_fps=5, task_in_state=True)
+    arguments = set(inspect.signature(CalvinEnv).parameters) - {"task", "render_mode"}
+    assert set(options.gym_kwargs) == arguments
+    assert {options.gym_kwargs[name] for name in ("steps_per_command", "render_fps")} == {7, 5}
+
+
 def test_parallel_tasks_are_refused_because_they_share_a_policy():
     with pytest.raises(DeskError, match="max_parallel_tasks must be 1"):
         CalvinEnvConfig(max_parallel_tasks=2)
 
 
-def rollout(use_async: bool):
-    config = CalvinEnvConfig(task="open_drawer, turn_on_led", cameras=[], steps_per_command=4)
+def rollout(use_async: bool, results_dir):
+    config = CalvinEnvConfig(
+        task="open_drawer, turn_on_led", cameras=[], steps_per_command=4, results_dir=str(results_dir)
+    )
     envs = make_env(config, n_envs=2, use_async_envs=use_async)
     assert list(envs) == ["open_drawer", "turn_on_led"]
     vector = envs["open_drawer"][0]
@@ -56,14 +86,17 @@ def rollout(use_async: bool):
     return np.array(states), np.array(ends), prepared
 
 
-def test_sync_and_async_agree_and_finished_episodes_freeze():
-    states, ends, prepared = rollout(use_async=False)
+def test_sync_and_async_agree_and_finished_episodes_freeze(tmp_path):
+    states, ends, prepared = rollout(use_async=False, results_dir=tmp_path / "sync")
     assert ends[:3].sum() == 0
     assert ends[3].all()
     np.testing.assert_array_equal(states[5], states[4])
     np.testing.assert_array_equal(states[7], states[4])
     assert prepared["observation.state"].shape == (2, 15)
     assert prepared["observation.control_mode"].tolist() == [[0.0], [0.0]]
-    other_states, other_ends, _ = rollout(use_async=True)
+    other_states, other_ends, _ = rollout(use_async=True, results_dir=tmp_path / "async")
     np.testing.assert_array_equal(other_states, states)
     np.testing.assert_array_equal(other_ends, ends)
+    for folder in ("sync", "async"):
+        lines = [json.loads(line) for line in (tmp_path / folder / "episodes.jsonl").read_text().splitlines()]
+        assert sorted(line["seed"] for line in lines) == [3, 4]

@@ -1,10 +1,12 @@
-"""From eval_info.json to the tables: every figure is checked against numbers worked out by hand."""
+"""From eval_info.json and episodes.jsonl to the tables: every figure is checked against numbers worked out by hand."""
 
 import json
 import sys
 
+import numpy as np
 import pytest
 
+from lerobot_lansar.benchmark import EPISODES_FILE, Chain
 from lerobot_lansar.report import report as report_module
 from lerobot_lansar.report import results
 from lerobot_lansar.report.report import ReportConfig, report
@@ -20,7 +22,8 @@ CHAINS = [
 @pytest.fixture(autouse=True)
 def _few_chains(monkeypatch):
     """Four chains instead of 1000: seed 1000 is chain 0 here as well."""
-    monkeypatch.setattr(results, "benchmark_chains", lambda: CHAINS)
+    chains = tuple(Chain(tuple(tasks), np.zeros(15), np.zeros(24)) for tasks in CHAINS)
+    monkeypatch.setattr(results, "load_chains", lambda: chains)
 
 
 def write_eval(folder, *groups):
@@ -39,9 +42,9 @@ def write_eval(folder, *groups):
 
 
 def write_lines(folder, rows, **settings):
-    """Writes (seed, chain, [(task, success)]) rows over two files, as two workers would."""
+    """Writes (seed, chain, [(task, success)]) rows as lines of the environment."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number, (seed, chain, commands) in enumerate(rows):
+    for seed, chain, commands in rows:
         line = {
             "seed": seed,
             "chain": chain,
@@ -53,7 +56,7 @@ def write_lines(folder, rows, **settings):
             "steps_per_command": 360,
             **settings,
         }
-        with (folder / f"episodes-{number % 2}.jsonl").open("a") as file:
+        with (folder / EPISODES_FILE).open("a") as file:
             file.write(json.dumps(line) + "\n")
 
 
@@ -194,7 +197,7 @@ def test_errors_are_one_message_and_exit_code_2(tmp_path, monkeypatch, capsys):
         ([f"--eval_dir={tmp_path}", "--seed=abc"], "seed"),
         ([f"--eval_dir={write_eval(tmp_path / 'a', ('calvin', [7.5]))}"], "sum of rewards 7.5"),
         ([f"--eval_dir={write_eval(tmp_path / 'b', ('calvin', []))}"], "holds no episode"),
-        ([f"--eval_dir={tmp_path / 'a'}", f"--results_dir={tmp_path / 'a'}"], "holds no episodes-*.jsonl"),
+        ([f"--eval_dir={tmp_path / 'a'}", f"--results_dir={tmp_path / 'a'}"], "holds no episodes.jsonl"),
     ]:
         code, printed = run_main(monkeypatch, capsys, *arguments)
         assert code == 2
@@ -204,7 +207,7 @@ def test_errors_are_one_message_and_exit_code_2(tmp_path, monkeypatch, capsys):
 
 def test_a_damaged_line_is_named(tmp_path, monkeypatch, capsys):
     folder = write_eval(tmp_path, ("calvin", [0.0]))
-    (folder / "episodes-1.jsonl").write_text('{"seed": 0}\n')
+    (folder / EPISODES_FILE).write_text('{"seed": 0}\n')
     code, printed = run_main(monkeypatch, capsys, f"--eval_dir={folder}")
     assert code == 2
-    assert "episodes-1.jsonl, line 1" in printed.err
+    assert "episodes.jsonl, line 1" in printed.err

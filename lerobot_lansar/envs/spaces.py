@@ -1,0 +1,48 @@
+"""Observation and action spaces of `CalvinEnv`."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from gymnasium import spaces
+
+from ..calvin import ACTION_NAMES, CAMERAS, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
+from ..desk import DeskError
+
+ACTION_SIZE = len(ACTION_NAMES["rel"])
+
+# Absolute actions: x, y, z (m), roll, pitch, yaw (rad), gripper. The desk accepts angles with any number of full turns;
+# the roll's range is that of a hand that points down.
+_ABSOLUTE_LOW = (-1.0, -1.0, 0.2, np.pi / 2, -np.pi, -np.pi, -1.0)
+_ABSOLUTE_HIGH = (1.0, 1.0, 1.0, np.pi * 3 / 2, np.pi, np.pi, 1.0)
+
+
+def environment_state_size(task_in_state: bool) -> int:
+    """How many numbers `environment_state` holds."""
+    return len(SCENE_OBS_NAMES) + (len(TASKS) if task_in_state else 0)
+
+
+def observation_space(cameras: Sequence[str], task_in_state: bool) -> spaces.Dict:
+    """The space of the observations that `CalvinEnv` describes.
+
+    Raises:
+        DeskError: A camera is unknown.
+    """
+    sizes = {"agent_pos": len(ROBOT_OBS_NAMES), "environment_state": environment_state_size(task_in_state)}
+    entries: dict[str, spaces.Space] = {
+        key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in sizes.items()
+    }
+    entries["control_mode"] = spaces.Box(0, 1, (1,), np.float32)
+    for camera in cameras:
+        if camera not in CAMERAS:
+            raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+    if cameras:
+        entries["pixels"] = spaces.Dict({c: spaces.Box(0, 255, (CAMERAS[c], CAMERAS[c], 3), np.uint8) for c in cameras})
+    return spaces.Dict(entries)
+
+
+def action_space(control_mode: str) -> spaces.Box:
+    """(7,) float32: the nominal range of relative or absolute actions; the desk takes larger ones too."""
+    if control_mode == "rel":
+        return spaces.Box(-1, 1, (ACTION_SIZE,), np.float32)
+    low, high = (np.array(bounds, dtype=np.float32) for bounds in (_ABSOLUTE_LOW, _ABSOLUTE_HIGH))
+    return spaces.Box(low, high, dtype=np.float32)
