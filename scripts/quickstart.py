@@ -1,7 +1,7 @@
-"""The whole line with LeRobot's own commands: record, convert, train, evaluate, report. Run by `make quickstart`.
+"""From demonstrations to success rates: record, convert, train, evaluate, report. Run by `make quickstart`.
 
-Every step is a command printed before it runs, so each can be repeated by hand. Steps whose result is there already
-are not repeated. Ends with outputs/quickstart/summary.json.
+Every step is an installed command, printed before it runs, so each can be repeated by hand. A step whose result exists
+is skipped. The last result is outputs/quickstart/summary.json.
 """
 
 import json
@@ -32,13 +32,13 @@ TASKS = [
     "turn_off_led",
     "lift_red_block_table",
 ]
-HARD = ["open_drawer", "lift_red_block_table"]  # get twice as many demonstrations as the others
+HARD = ["open_drawer", "lift_red_block_table"]  # recorded twice as often as the others
 EPISODES_PER_TASK = 10
-EVALUATION_SEED = 100_000  # far from the demonstrations' seed: starts that were never recorded
+EVALUATION_SEED = 100_000  # far from the seed of the demonstrations: none of these starts was recorded
 
 
 def run(title: str, *command: object, log: Path | None = None) -> None:
-    """Runs one of the installed commands in the checkout, with its output in `log` if given.
+    """Runs an installed command from the repository's root; its output goes to `log` if given.
 
     Raises:
         QuickstartError: The command failed.
@@ -59,8 +59,8 @@ def run(title: str, *command: object, log: Path | None = None) -> None:
         )
     if done.returncode:
         raise QuickstartError(
-            f"quickstart stopped: `{words[0]}` ended with exit code {done.returncode}; its message is "
-            f"{f'in {log}' if log else 'above'}"
+            f"quickstart stopped: `{words[0]}` ended with exit code {done.returncode}; see "
+            f"{log if log else 'its message above'}"
         )
     print(f"--- {title}: {time.time() - started:.0f} s", flush=True)
 
@@ -70,7 +70,7 @@ class QuickstartError(Exception):
 
 
 def record_and_convert() -> None:
-    """Demonstrations without pictures (state and language suffice here), then a LeRobotDataset of them."""
+    """Records demonstrations without pictures (this policy reads state and language), then converts them."""
     if not (DATA / "validation").exists():
         run(
             "record demonstrations",
@@ -100,11 +100,11 @@ def record_and_convert() -> None:
 
 
 def train(name: str, *options: str, log: Path | None = None) -> Path:
-    """Trains the recommended preset with a CLIP that needs no download; returns the checkpoint."""
+    """Trains with the recommended configuration and a CLIP that needs no download; returns the checkpoint."""
     checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
     if not checkpoint.exists():
-        shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses a folder that an interrupted run left
-        shutil.rmtree(OUT / f"eval_{name}", ignore_errors=True)  # of an earlier checkpoint
+        shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses the folder of an interrupted run
+        shutil.rmtree(OUT / f"eval_{name}", ignore_errors=True)  # evaluated an earlier checkpoint
         run(
             f"train ({name})",
             "lerobot-train",
@@ -121,7 +121,7 @@ def train(name: str, *options: str, log: Path | None = None) -> Path:
 
 
 def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None) -> Path:
-    """Evaluates every task from unseen starts, with the report."""
+    """Evaluates every task from unseen starts and writes the report; returns the evaluation's folder."""
     folder = OUT / f"eval_{name}"
     if not (folder / "eval_info.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
@@ -148,15 +148,15 @@ def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None
 
 
 def untrained() -> Path:
-    """The same network and statistics with untrained weights: one update with learning rate 0, then evaluated."""
+    """Evaluates the same network with random weights: one update with learning rate 0 makes the checkpoint."""
     log = OUT / "untrained.log"
     checkpoint = train("untrained", "--steps=1", "--policy.learning_rate=0", log=log)
-    one_core = "--eval.use_async_envs=false"  # the other one trains
+    one_core = "--eval.use_async_envs=false"  # training uses the other one
     return evaluate("untrained", checkpoint, one_core, log=log)
 
 
 def success(folder: Path) -> dict[str, dict[str, float]]:
-    """Episodes and success rate of every task, from LeRobot's eval_info.json."""
+    """Number of episodes and success rate of every task, from LeRobot's eval_info.json."""
     info = json.loads((folder / "eval_info.json").read_text())
     rates = {}
     for entry in info["per_task"]:
@@ -169,14 +169,14 @@ def success(folder: Path) -> dict[str, dict[str, float]]:
 
 
 def total(tasks: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Episodes and success rate over all tasks."""
+    """Number of episodes and success rate over all tasks."""
     episodes = sum(task["episodes"] for task in tasks.values())
     solved = sum(task["episodes"] * task["success_rate"] for task in tasks.values())
     return {"episodes": int(episodes), "success_rate": round(solved / episodes, 4)}
 
 
 def main() -> None:
-    """Runs the line and writes the summary."""
+    """Runs all steps and writes the summary."""
     os.chdir(ROOT)
     started = time.time()
     record_and_convert()
@@ -193,7 +193,7 @@ def main() -> None:
         "minutes": round((time.time() - started) / 60, 1),
     }
     file = OUT / "summary.json"
-    if file.exists():  # a repeated run only looks at results: keep the time that making them took
+    if file.exists():  # a repeated run skips finished steps: keep the time of the run that did the work
         summary["minutes"] = max(summary["minutes"], json.loads(file.read_text())["minutes"])
     file.write_text(json.dumps(summary, indent=2) + "\n")
     print(f"\n{json.dumps(summary, indent=2)}\n\nsummary: {file}")

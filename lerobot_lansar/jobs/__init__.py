@@ -1,7 +1,7 @@
-"""Long work: cut into shards that run here, under Slurm or on Ray, in folders that appear complete or not at all.
+"""Long work, cut into shards that run here, under Slurm or on Ray; its output appears complete or not at all.
 
-executors   shards in local processes, or handed over to cluster
+executors   runs the shards: in local processes, or through cluster
 cluster     Slurm and Ray, through datatrove
-work        what executors are given: SlurmConfig, WorkerDied
-staging     the hidden folder that an output is prepared in: lock, request, marks, resuming
+work        types that both share: Work, SlurmConfig, WorkerDied
+staging     the hidden folder in which an output is prepared: lock, request, submitted mark, resuming
 """

@@ -1,4 +1,4 @@
-"""Shards under Slurm and on Ray, by datatrove's executors."""
+"""Runs shards under Slurm and on Ray, through datatrove's executors."""
 
 import shutil
 import subprocess
@@ -13,7 +13,7 @@ from .work import SlurmConfig, Work, WorkerDied
 
 
 class Step(PipelineStep):
-    """One of datatrove's pipeline steps, made of a function of the shard's number."""
+    """A pipeline step of datatrove that calls a function with the shard's number."""
 
     name = "lansar"
     type = "work"
@@ -29,7 +29,7 @@ class Step(PipelineStep):
 
 
 def submit_to_slurm(work: Work, shards: int, finish: Work, workers: int, slurm: SlurmConfig, logging_dir: Path) -> None:
-    """Submits an array of jobs for the shards, and one job that depends on it for the finishing step.
+    """Submits an array of jobs for the shards, and a job for the finishing step that waits for them.
 
     Raises:
         subprocess.CalledProcessError: Slurm refused a job; those it had taken are cancelled.
@@ -52,16 +52,16 @@ def submit_to_slurm(work: Work, shards: int, finish: Work, workers: int, slurm: 
     try:
         last.run()
     except BaseException:
-        if submitted:  # or those of the next try would write the same files
+        if submitted:  # otherwise the next try's jobs would write the same files at the same time
             subprocess.run(["scancel", *submitted], check=False)
         raise
 
 
 def run_on_ray(work: Work, shards: int, workers: int, logging_dir: Path) -> None:
-    """Runs all shards on the Ray cluster that is configured, or on a local one.
+    """Runs all shards on the configured Ray cluster, or on a local one.
 
     Raises:
-        WorkerDied: Shards failed there.
+        WorkerDied: Some shards failed.
     """
     import ray
 
@@ -75,7 +75,7 @@ def run_on_ray(work: Work, shards: int, workers: int, logging_dir: Path) -> None
 
 
 class _Jobs(list[str]):
-    """The numbers of submitted jobs: datatrove calls it with what sbatch printed."""
+    """Ids of submitted jobs. datatrove calls it with the output of sbatch, to get the id."""
 
     def __call__(self, printed: str) -> str:
         self.append(printed.split()[-1])
@@ -83,7 +83,7 @@ class _Jobs(list[str]):
 
 
 def _empty_folders(logging_dir: Path) -> list[str]:
-    """Folders for the logs of both steps, without datatrove's completion markers of an earlier run."""
+    """Log folders of both steps; removes the completion markers of an earlier run, or datatrove would skip shards."""
     folders = [logging_dir / name for name in ("work", "finish")]
     for folder in folders:
         shutil.rmtree(folder / "completions", ignore_errors=True)
@@ -97,7 +97,7 @@ def _slurm_options(slurm: SlurmConfig) -> dict[str, Any]:
         "qos": slurm.qos,
         "mem_per_cpu_gb": slurm.mem_per_cpu_gb,
         "sbatch_args": dict(slurm.sbatch_args),
-        # datatrove's own commands must be found where the jobs run
+        # so that jobs find datatrove's own commands
         "venv_path": str(Path(sys.prefix) / "bin" / "activate") if sys.prefix != sys.base_prefix else None,
         "mail_type": "NONE",
     }

@@ -1,6 +1,6 @@
 """Runs work that is cut into shards, then one finishing step: in local processes, under Slurm or on Ray.
 
-A shard's number decides what it does, so the result is the same wherever and however often it runs. Each shard checks
+A shard's number decides what it does, so its result is the same wherever and however often it runs. Each shard checks
 for its own output; datatrove's completion markers can outlive it.
 """
 
@@ -52,16 +52,16 @@ def run_shards(
     Args:
         work: Called for every shard, also for those that an earlier call finished.
         shards: How many there are.
-        finish: Called with a number too, 0.
+        finish: Called once, with 0 as its last argument.
         executor: One of `EXECUTORS`.
-        workers: Processes at a time; with Slurm the array's limit of tasks at a time.
+        workers: Processes at a time; under Slurm, the array's limit of jobs at a time.
         slurm: Used by the executor of that name.
         logging_dir: Where Slurm's and Ray's logs are kept.
-        progress: How many of `total` units are done, for the progress bar.
-        total, unit, desc: Of the bar.
+        progress: Returns how many of `total` units are done, for the progress bar.
+        total, unit, desc: The progress bar's length, unit and title.
 
     Returns:
-        Whether all is done; False when jobs were submitted that go on without this process.
+        True when all work is done, False when jobs were submitted that run without this process.
 
     Raises:
         WorkerDied: A worker was killed; the same call goes on where it stopped.
@@ -85,7 +85,7 @@ def run_shards(
 
 
 def _run_here(work: Work, shards: int, workers: int) -> None:
-    """All shards in processes of this machine; a single worker is this process."""
+    """Runs all shards in processes of this machine; with one worker, in this process."""
     function, arguments = work
     if workers == 1:
         for shard in range(shards):
@@ -100,7 +100,7 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
         for future in futures:
             if future.done():
                 future.result()
-    except BaseException as error:  # whatever the other workers are doing would hold us up
+    except BaseException as error:  # end the other workers too, whatever they are doing
         for process in set(multiprocessing.active_children()) - others:
             process.terminate()
         if isinstance(error, BrokenProcessPool):
@@ -113,8 +113,7 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
 
 
 def _prepare_worker() -> None:
-    """Ctrl-C reaches a terminal's whole process group: ending the workers is the main process' part. They end on
-    their own when it was killed."""
+    """Makes a worker ignore Ctrl-C, so that the main process alone reacts to it, and exit when that was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

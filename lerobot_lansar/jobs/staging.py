@@ -1,4 +1,4 @@
-"""Output folders that appear complete or not at all, and work on them that goes on where it stopped."""
+"""Atomic, resumable creation of an output folder: prepared in a staging folder, then renamed."""
 
 import json
 import shutil
@@ -10,11 +10,11 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 _LOCK, _REQUEST, _SUBMITTED = "lock", "request.json", "submitted"
-_PATIENCE = 3.0  # s; long enough for the workers of a killed run to notice and go
+_PATIENCE = 3.0  # s to wait for another process, in case it is just ending
 
 
 def write_atomically(file: Path, text: str) -> None:
-    """Writes a file that is complete whenever it is there."""
+    """Writes a file that nobody ever sees incomplete."""
     partial = file.with_name(file.name + ".partial")
     partial.write_text(text)
     partial.rename(file)
@@ -30,18 +30,18 @@ def staging(
 ) -> Iterator[None]:
     """Makes `folder` the place where `target` is prepared: new, or as an interrupted run of the request left it.
 
-    A lock that dies with its process keeps two runs from sharing it. If the block raises, nothing counts as submitted,
-    and a folder without any result is removed.
+    Only one process can be in the block; its lock ends with it, even if it is killed. If the block raises, nothing
+    counts as submitted, and a folder without any result is removed.
 
     Args:
         folder: Where to prepare.
-        target: What will appear, for messages.
+        target: The output that will appear, for messages.
         request: Everything that decides the result; JSON.
         has_results: Whether the folder holds anything worth keeping.
-        submitting: The block hands the work to jobs that write into the folder after it.
+        submitting: Whether the block submits jobs that will write into the folder after it.
 
     Raises:
-        ValueError: Another process or jobs are writing, or the folder holds results of another request.
+        ValueError: Another process is writing, submitted jobs may be, or the folder holds results of another request.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -62,13 +62,13 @@ def staging(
 
 def publish(folder: Path, result: Path, target: Path) -> None:
     """Renames `result`, the finished part of a staging folder, to its place and removes the rest."""
-    (folder / _SUBMITTED).unlink(missing_ok=True)  # first: a process killed below leaves nothing that is waited for
+    (folder / _SUBMITTED).unlink(missing_ok=True)  # first: if killed below, no later run waits for jobs
     result.rename(target)
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def refuse_submitted(folder: Path, target: Path) -> None:
-    """Raises ValueError if jobs that were submitted are still to write into a staging folder."""
+    """Raises ValueError if submitted jobs may still write into a staging folder."""
     if (folder / _SUBMITTED).exists():
         raise ValueError(
             f"Slurm jobs for {target} were submitted already: wait for them, or cancel them and delete "
@@ -79,7 +79,7 @@ def refuse_submitted(folder: Path, target: Path) -> None:
 def _claim(folder: Path, target: Path, request: dict[str, Any], has_results: Callable[[Path], bool]) -> None:
     refuse_submitted(folder, target)
     file = folder / _REQUEST
-    # Without its request nothing tells what the results are.
+    # Results without their request are of unknown options: start anew.
     if not (file.exists() and has_results(folder)):
         _remove(path for path in folder.iterdir() if path.name != _LOCK)
         write_atomically(file, json.dumps(request, indent=1) + "\n")
@@ -87,7 +87,7 @@ def _claim(folder: Path, target: Path, request: dict[str, Any], has_results: Cal
         raise ValueError(
             f"{folder} holds work that was begun with other options: repeat those of {file}, or delete that folder"
         )
-    _remove(folder.glob("*.partial"))  # of processes that were killed
+    _remove(folder.glob("*.partial"))  # left by killed processes
 
 
 def _remove(paths: Iterator[Path]) -> None:

@@ -1,4 +1,4 @@
-"""What executors are given, and how it can fail."""
+"""Types that the executors share: work, Slurm's options, the error of a lost worker."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 from ..command import CommandError
 
 Work = tuple[Callable[..., None], tuple[Any, ...]]
-"""A module's own function and its first arguments; a shard's number comes last. Both are pickled."""
+"""A function at the top level of a module and its first arguments; the shard's number is its last one. Pickled."""
 
 
 class WorkerDied(CommandError):
@@ -26,7 +26,7 @@ class SlurmConfig:
     qos: str = "normal"
     # Memory per core, in GB.
     mem_per_cpu_gb: int = 4
-    # Shards that one element of the job array runs, one after the other.
+    # Shards that one job of the array runs, one after the other.
     shards_per_job: int = 1
     # Further options of sbatch, for example account.
     sbatch_args: dict[str, str] = field(default_factory=dict)
