@@ -1,15 +1,19 @@
-"""Work under Slurm and on Ray gives the same files as in local processes."""
+"""Work in local processes ends as it should; under Slurm and on Ray it gives the same files."""
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lerobot_lansar.jobs import executors
+from lerobot_lansar.jobs.work import SlurmConfig, WorkerDied
 
 OPTIONS = [
     "--cameras=[]",
@@ -113,6 +117,69 @@ def leave_note(folder, shard):
     (folder / f"{shard}").touch()
 
 
+def misbehave(folder, how, shard):
+    """Shard 0 leaves its process id and works for ever; shard 1 then ends its process or raises."""
+    note = folder / "process"
+    if shard == 0:
+        note.write_text(str(os.getpid()))
+        time.sleep(600)
+    while not (note.exists() and note.read_text()):
+        time.sleep(0.01)
+    if how == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+    raise ValueError(f"shard {shard} failed")
+
+
+def run_here(work, finish, workers=2, shards=4):
+    return executors.run_shards(
+        work,
+        shards,
+        finish,
+        executor="local",
+        workers=workers,
+        slurm=SlurmConfig(),
+        logging_dir=Path("unused"),
+        progress=lambda: 0,
+        total=shards,
+        unit="shard",
+    )
+
+
+def is_gone(process, seconds=30):
+    deadline = time.time() + seconds
+    while time.time() < deadline:
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_local_work_runs_all_shards_before_the_finishing_step(workers, tmp_path):
+    done, finished = tmp_path / "done", tmp_path / "finished"
+    done.mkdir()
+    finished.mkdir()
+    assert run_here((leave_note, (done,)), (leave_note, (finished,)), workers)
+    assert sorted(note.name for note in done.iterdir()) == ["0", "1", "2", "3"]
+    assert [note.name for note in finished.iterdir()] == ["0"]
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "message"),
+    [("dies", WorkerDied, "a worker process was killed"), ("raises", ValueError, "shard 1 failed")],
+)
+@pytest.mark.parametrize("main_thread", [True, False])
+def test_a_worker_that_dies_or_fails_ends_the_others(how, error, message, main_thread, tmp_path):
+    """Also when the work was begun from another thread than the main one."""
+    arguments = (misbehave, (tmp_path, how)), (leave_note, (tmp_path,))
+    with ThreadPoolExecutor(1) as thread, pytest.raises(error, match=message):
+        run_here(*arguments) if main_thread else thread.submit(run_here, *arguments).result()
+    assert not (tmp_path / "0").exists(), "the finishing step must not run"
+    assert is_gone(int((tmp_path / "process").read_text()))
+
+
 def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_failed(slurm, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", slurm)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # the jobs import leave_note
@@ -127,7 +194,7 @@ def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_f
             (leave_note, (finished,)),
             executor="slurm",
             workers=2,
-            slurm=executors.SlurmConfig(partition="cpu", shards_per_job=2),
+            slurm=SlurmConfig(partition="cpu", shards_per_job=2),
             logging_dir=tmp_path / "logs",
             progress=lambda: 0,
             total=3,
@@ -173,7 +240,7 @@ def test_ray_records_the_same(local, tmp_path):
 
 def test_slurm_jobs_convert_the_same(local, converted, slurm, tmp_path):
     options = ["--executor=slurm", "--workers=2", "--slurm.partition=cpu", "--slurm.shards_per_job=8"]
-    for _ in range(2):  # again, though the logs of the first time, which stay, say that all is done
+    for _ in range(2):  # the second time too, although the first time's logs remain and say that all is done
         convert(local, tmp_path / "out", *options, PATH=slurm)
         script = (tmp_path / "out.slurm_logs" / "work" / "launch_script.slurm").read_text()
         assert "#SBATCH --partition=cpu" in script

@@ -93,9 +93,10 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
         return
     others = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, initializer=_prepare_worker)
+    pool = ProcessPoolExecutor(workers, context, initializer=_follow_parent)
     try:
-        futures = [pool.submit(function, *arguments, shard) for shard in range(shards)]
+        with _blocked_interrupts():  # the workers start here
+            futures = [pool.submit(function, *arguments, shard) for shard in range(shards)]
         wait(futures, return_when=FIRST_EXCEPTION)
         for future in futures:
             if future.done():
@@ -112,9 +113,18 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
         pool.shutdown(cancel_futures=True)
 
 
-def _prepare_worker() -> None:
-    """Makes a worker ignore Ctrl-C, so that the main process alone reacts to it, and exit when that was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextmanager
+def _blocked_interrupts() -> Iterator[None]:
+    """Holds Ctrl-C back. Processes that start in the block ignore it for good, so that their parent alone reacts."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _follow_parent() -> None:
+    """Makes a worker exit when the main process was killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
