@@ -25,7 +25,7 @@ import pybullet as p
 from tqdm import tqdm
 
 from lerobot_lansar.desk import Desk, DeskError
-from lerobot_lansar.desk.cameras import CAMERAS, STATIC_EYE, STATIC_TARGET, STATIC_UP
+from lerobot_lansar.desk.cameras import INTRINSICS, STATIC_EYE, STATIC_TARGET, STATIC_UP
 
 ROUNDS = 5
 
@@ -78,17 +78,17 @@ class Naive:
             p.getContactPoints(bodyA=body, physicsClientId=client)
             p.getBasePositionAndOrientation(body, physicsClientId=client)
             p.getBaseVelocity(body, physicsClientId=client)
-        table = self._desk._table.body
+        furniture = self._desk._furniture.body
         for joint in range(4):
-            p.getJointState(table, joint, physicsClientId=client)
+            p.getJointState(furniture, joint, physicsClientId=client)
 
     def _picture(self, size: int, eye: object, target: object, up: object, camera: str) -> None:
-        lens = CAMERAS[camera]
+        intrinsics = INTRINSICS[camera]
         p.getCameraImage(
             size,
             size,
             p.computeViewMatrix(eye, target, up),
-            p.computeProjectionMatrixFOV(lens.fov, 1.0, lens.near, lens.far),
+            p.computeProjectionMatrixFOV(intrinsics.fov, 1.0, intrinsics.near, intrinsics.far),
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self._desk._client,
         )

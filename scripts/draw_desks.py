@@ -1,7 +1,7 @@
 """Draws the pictures of docs/desk.md.
 
 python scripts/draw_desks.py                 docs/images/desks.png: the built-in desks by both cameras
-python scripts/draw_desks.py --assets=DIR    docs/images/looks.jpg too: every look, and PyBullet's own
+python scripts/draw_desks.py --assets=DIR    docs/images/looks.jpg as well: all renderers
 """
 
 from dataclasses import dataclass
@@ -11,36 +11,38 @@ import draccus
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from lerobot_lansar.calvin import FURNITURE
 from lerobot_lansar.desk import SCENES, Desk
+from lerobot_lansar.desk.scenes import SWITCH_TRAVEL
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 
 
 @dataclass
 class Options:
-    """Where CALVIN's files are."""
+    """What to draw."""
 
-    # The `data` folder of a calvin_env checkout.
+    # The `data` folder of a calvin_env checkout; without it, only the built-in desks are drawn.
     assets: Path | None = None
 
 
 def posed(scene: str, assets: Path | None = None, renderer: str = "fast") -> Desk:
-    """A desk with drawer and door half open, and the lights on."""
+    """A desk with drawer and door partly open, and the lights on."""
     desk = Desk(scene, assets, cameras=(), renderer=renderer)
     state = desk.reset(seed=3)["scene_obs"]
-    state[:6] = [0.1, 0.15, 0.0, 0.088, 1.0, 1.0]
+    state[FURNITURE] = [0.1, 0.15, 0.0, SWITCH_TRAVEL, 1.0, 1.0]
     desk.reset(scene_obs=state)
     return desk
 
 
 def column(scene: str) -> np.ndarray:
-    """Static above gripper picture of one built-in scene."""
+    """The static camera's picture of a built-in scene above the gripper camera's."""
     with posed(scene) as desk:
         return np.vstack([desk.render("static", 300), desk.render("gripper", 300)])
 
 
 def looks(assets: Path) -> Image.Image:
-    """One row per scene: ours and PyBullet's, in TinyRenderer's and in the OpenGL look, on both kinds of assets."""
+    """One row per scene, one column per renderer, on both kinds of assets."""
     kinds = [
         ("built in, fast", None, "fast"),
         ("built in, fast_gl", None, "fast_gl"),

@@ -1,4 +1,4 @@
-"""Draws docs/images/tasks.jpg: a demonstration of each of the 34 tasks, six moments of it, the four scenes in turn.
+"""Draws docs/images/tasks.jpg: six moments of a demonstration of each of the 34 tasks, in the four scenes in turn.
 
 python scripts/draw_tasks.py [--assets=DIR] [--output=FILE]
 """
@@ -16,11 +16,11 @@ from lerobot_lansar.desk import Desk
 
 SIZE, MOMENTS, COLUMNS, LABEL = 112, 6, 2, 18
 IN_TURN = "BADC"
-"""Scenes; in this order the switch is worked in A and D, where the arm stays in the picture."""
+"""Scenes; this order has the switch tasks in A and D, where the arm stays in the picture."""
 
 
 def demonstration(desk: Desk, task: str, seed: int) -> Demonstration:
-    """The first accepted demonstration of `task`."""
+    """The first demonstration of `task` that succeeds."""
     for attempt in range(20):
         found = demonstrate(desk, task, np.random.default_rng([seed, attempt]))
         if found is not None:
@@ -29,7 +29,7 @@ def demonstration(desk: Desk, task: str, seed: int) -> Demonstration:
 
 
 def strip(found: Demonstration, title: str) -> Image.Image:
-    """Its name, and pictures of the static camera from the first to the last frame."""
+    """A title above pictures of the static camera, from the first frame to the last."""
     picture = Image.new("RGB", (SIZE * MOMENTS, SIZE + LABEL), "white")
     ImageDraw.Draw(picture).text((3, 2), title, "black", ImageFont.load_default(12))
     for column, t in enumerate(np.linspace(0, len(found) - 1, MOMENTS).round().astype(int)):
@@ -39,7 +39,7 @@ def strip(found: Demonstration, title: str) -> Image.Image:
 
 
 def main() -> None:
-    """See the module."""
+    """Draws all tasks onto one sheet."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--assets")
     parser.add_argument("--output", type=Path, default=Path("docs/images/tasks.jpg"))

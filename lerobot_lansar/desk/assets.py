@@ -1,15 +1,16 @@
-"""Where a desk's bodies come from: a CALVIN checkout's `data` folder, or URDFs generated from a scene's numbers."""
+"""The URDF files of a desk: from a calvin_env checkout's `data` folder, or generated from a scene's numbers."""
 
 import re
+import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from multiprocessing.util import Finalize
 from pathlib import Path
 
 from . import builtin
 from .errors import DeskError
-from .scenes import Scene
+from .scenes import SCENES, Scene
 
 _LFS = b"version https://git-lfs"
 
@@ -19,9 +20,10 @@ class Assets:
     """URDF files of one scene, ready to load.
 
     Attributes:
-        kind: `"built-in"` or `"original"`; every results file states it.
+        kind: `"built-in"` or `"original"`.
+        robot, desk, plane: One URDF file each.
+        blocks: Colour to URDF file.
         scale: Global scaling to load the desk and the blocks with.
-        temporary: The files go away once they are loaded.
     """
 
     kind: str
@@ -30,23 +32,28 @@ class Assets:
     plane: Path
     blocks: dict[str, Path]
     scale: float
-    temporary: bool
 
 
-@contextmanager
-def open_assets(scene: Scene, folder: str | Path | None) -> Iterator[Assets]:
-    """Assets of `scene`: those in `folder`, or built-in ones (written to a temporary folder) when it is None.
+def find_assets(scene: Scene, folder: str | Path | None) -> Assets:
+    """Assets of `scene`: those in `folder`, or the built-in ones if it is None.
 
     Raises:
         DeskError: `folder` lacks a file that the scene needs.
     """
-    if folder is not None:
-        yield _original(scene, Path(folder))
-        return
-    with tempfile.TemporaryDirectory(prefix="lansar_desk_") as name:
-        path = Path(name)
-        files = builtin.write(scene, path)
-        yield Assets("built-in", path / "robot.urdf", path / "desk.urdf", path / "plane.urdf", files, 1.0, True)
+    return _built_in(scene.name) if folder is None else _original(scene, Path(folder))
+
+
+@cache
+def _built_in(name: str) -> Assets:
+    """Writes the built-in files of a scene, once per process, into a folder that is removed when the process ends.
+
+    `Finalize` rather than `atexit`: it also runs in multiprocessing's children, and a child that inherited a folder
+    leaves it to its parent.
+    """
+    folder = Path(tempfile.mkdtemp(prefix=f"lansar_desk_{name}_"))
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)
+    blocks = builtin.write(SCENES[name], folder)
+    return Assets("built-in", folder / "robot.urdf", folder / "desk.urdf", folder / "plane.urdf", blocks, scale=1.0)
 
 
 def _original(scene: Scene, folder: Path) -> Assets:
@@ -57,7 +64,6 @@ def _original(scene: Scene, folder: Path) -> Assets:
         plane=folder / "plane" / "plane.urdf",
         blocks={c: folder / "blocks" / f"block_{c}_{size}.urdf" for c, size in scene.blocks.items()},
         scale=0.8,
-        temporary=False,
     )
     for file in (assets.robot, assets.desk, assets.plane, *assets.blocks.values()):
         _check(file, scene)
@@ -67,7 +73,7 @@ def _original(scene: Scene, folder: Path) -> Assets:
 
 
 def _check(file: Path, scene: Scene) -> None:
-    """Bullet says nothing of a missing texture, and loads a Git LFS pointer as an empty mesh."""
+    """Refuses what Bullet would load without a word: a missing texture, and a Git LFS pointer as an empty mesh."""
     if not file.is_file():
         raise DeskError(
             f"asset file {file} is missing; assets must name the `data` folder of a calvin_env checkout "

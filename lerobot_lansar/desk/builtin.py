@@ -1,8 +1,8 @@
 """The built-in desk: URDFs written from a scene's numbers and the Panda that ships with pybullet_data.
 
-Bodies, links, joints, limits, sizes, masses and friction are CALVIN's, shapes are boxes, prisms, a cylinder and a
-sphere, looks are our own. Handles have their measured sizes, so a hand that pulls the original drawer pulls this one.
-Lengths in metres, nothing is scaled on loading.
+Bodies, links, joints, limits, sizes, masses and friction are CALVIN's; shapes are boxes, prisms, a cylinder and a
+sphere; colours are our own. Handles have the sizes of CALVIN's, so a hand that can open the original drawer can open
+this one. Lengths are in metres; nothing is scaled on loading.
 """
 
 import itertools
@@ -29,9 +29,9 @@ def write(scene: Scene, folder: Path) -> dict[str, Path]:
     (folder / "desk.urdf").write_text(_desk(scene, folder))
     (folder / "plane.urdf").write_text(_plane(folder))
     blocks = {}
-    for color, variant in scene.blocks.items():
+    for color, size in scene.blocks.items():
         blocks[color] = folder / f"block_{color}.urdf"
-        blocks[color].write_text(_block(color, BLOCK_LENGTHS[variant]))
+        blocks[color].write_text(_block(color, BLOCK_LENGTHS[size]))
     for file in folder.glob("*.urdf"):
         for name in set(re.findall(r'"(box_\S+)\.obj"', file.read_text())):
             x, y, z = (float(size) / 2 for size in name.split("_")[1:])
@@ -45,10 +45,10 @@ def write(scene: Scene, folder: Path) -> dict[str, Path]:
 def _shape(geometry: str, color: Color, xyz: Sequence[float] = (0, 0, 0), collides: bool = True) -> str:
     rgba = " ".join(f"{c:.3f}" for c in (*color, 1.0))
     origin = f'<origin xyz="{xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f}"/>'
-    # Bullet's OpenGL renderer lights boxes as if they were round; it does not do so with meshes
-    seen = re.sub(r'<box size="(\S+) (\S+) (\S+)"/>', r'<mesh filename="box_\1_\2_\3.obj"/>', geometry)
+    # Bullet's OpenGL renderer lights boxes as if they were round, but not meshes
+    drawn = re.sub(r'<box size="(\S+) (\S+) (\S+)"/>', r'<mesh filename="box_\1_\2_\3.obj"/>', geometry)
     visual = (
-        f"<visual>{origin}<geometry>{seen}</geometry>"
+        f"<visual>{origin}<geometry>{drawn}</geometry>"
         f'<material name="c{rgba}"><color rgba="{rgba}"/></material></visual>'
     )
     return visual + (f"<collision>{origin}<geometry>{geometry}</geometry></collision>" if collides else "")
@@ -81,7 +81,7 @@ def _prism(folder: Path, name: str, x: Range, profile: Sequence[tuple[float, flo
 
 
 def _link(name: str, mass: float, shapes: str, contact: str = "") -> str:
-    # Bullet computes the inertia from the collision shapes; the tag must be there all the same.
+    # Bullet computes the inertia from the collision shapes, but requires the tag
     inertial = f'<inertial><mass value="{mass}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
     return f'<link name="{name}">{contact}{inertial}{shapes}</link>'
 
@@ -97,14 +97,14 @@ def _joint(
     parent: str = "base_link",
 ) -> str:
     kind = "fixed" if axis is None else "prismatic"
-    moves = ""
+    motion = ""
     if axis is not None:
-        moves = (
+        motion = (
             f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/><limit lower="0" upper="{travel}" effort="0" velocity="0"/>'
         )
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{xyz[0]} {xyz[1]} {xyz[2]}" rpy="{roll} 0 0"/>'
-        f'<parent link="{parent}"/><child link="{child}"/>{moves}</joint>'
+        f'<parent link="{parent}"/><child link="{child}"/>{motion}</joint>'
     )
 
 
@@ -123,7 +123,7 @@ def _block(color: str, length: float) -> str:
 
 
 def _plane(folder: Path) -> str:
-    """A floor of tiles in two shades, each shade one mesh; what carries is one big box."""
+    """A floor of tiles in two shades, one mesh per shade; one big box collides."""
     shapes = []
     for odd, shade in enumerate((0.93, 1.0)):
         lines, faces = ["vn 0 0 1"], []
@@ -141,26 +141,17 @@ def _plane(folder: Path) -> str:
 
 
 def _desk(scene: Scene, folder: Path) -> str:
-    """CALVIN's desk; link order (so the indices too): button, switch, slide, drawer, led, light, plank."""
+    """CALVIN's desk; its links, and so their indices, in CALVIN's order."""
     tilted, across = math.radians(60), math.radians(150)  # the cabinet's front leans back by 30 degrees
+    button, switch, slide = (
+        (scene.button_x, BUTTON_Y, 0.46),
+        (scene.switch_x, 0.0609, 0.4949),
+        (scene.slide_x, 0.075, 0.5353),
+    )
     joints = [
-        _joint("base__button", "button_link", (scene.button_x, BUTTON_Y, 0.46), axis=(0, 0, -1), travel=BUTTON_TRAVEL),
-        _joint(
-            "base__switch",
-            "switch_link",
-            (scene.switch_x, 0.0609, 0.4949),
-            roll=across,
-            axis=(0, 0, -1),
-            travel=SWITCH_TRAVEL,
-        ),
-        _joint(
-            "base__slide",
-            "slide_link",
-            (scene.slide_x, 0.075, 0.5353),
-            roll=tilted,
-            axis=(-1, 0, 0),
-            travel=scene.slide_travel,
-        ),
+        _joint("base__button", "button_link", button, axis=(0, 0, -1), travel=BUTTON_TRAVEL),
+        _joint("base__switch", "switch_link", switch, roll=across, axis=(0, 0, -1), travel=SWITCH_TRAVEL),
+        _joint("base__slide", "slide_link", slide, roll=tilted, axis=(-1, 0, 0), travel=scene.slide_travel),
         _joint("base__drawer", "drawer_link", (scene.drawer_x, 0.0, 0.32), axis=(0, -1, 0), travel=DRAWER_TRAVEL),
         _joint("base__led", "led_link", (scene.led_x, 0.16, 0.6558)),
         _joint("base__light", "light_link", (scene.light_x, 0.16, 0.6758)),
@@ -203,16 +194,18 @@ def _base(scene: Scene, folder: Path) -> str:
         _box(hole, (-0.16, 0.06), (0.30, 0.32), dark),
     ]
     # a low square rim around the button
-    bx, by, inner, outer = scene.button_x, BUTTON_Y, 0.032, 0.040
+    x, y, inner, outer = scene.button_x, BUTTON_Y, 0.032, 0.040
     rim = (0.44, 0.46)
     pieces += [
-        _box((bx - outer, bx + outer), (by - outer, by - inner), rim, dark),
-        _box((bx - outer, bx + outer), (by + inner, by + outer), rim, dark),
-        _box((bx - outer, bx - inner), (by - inner, by + inner), rim, dark),
-        _box((bx + inner, bx + outer), (by - inner, by + inner), rim, dark),
+        _box((x - outer, x + outer), (y - outer, y - inner), rim, dark),
+        _box((x - outer, x + outer), (y + inner, y + outer), rim, dark),
+        _box((x - outer, x - inner), (y - inner, y + inner), rim, dark),
+        _box((x + inner, x + outer), (y - inner, y + inner), rim, dark),
     ]
     legs = [
-        _box(x, y, (0.0, 0.40), wood) for x in ((-0.44, -0.40), (0.40, 0.44)) for y in ((-0.18, -0.148), (0.148, 0.18))
+        _box(across, along, (0.0, 0.40), wood)
+        for across in ((-0.44, -0.40), (0.40, 0.44))
+        for along in ((-0.18, -0.148), (0.148, 0.18))
     ]
     return "".join(pieces + legs)
 
@@ -263,7 +256,7 @@ def _robot() -> str:
     """pybullet_data's Panda with CALVIN's longer fingers, finger-tip pads, camera mount and TCP.
 
     The added links come in CALVIN's order, so link and joint indices agree with the original robot. The arm is drawn
-    with its collision meshes: a tenth of the triangles, and drawing is what a control step costs.
+    with its collision meshes, which have a tenth of the triangles: drawing takes most of a control step's time.
     """
     meshes = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes"
     tree = ElementTree.parse(meshes.parent / "panda.urdf")
@@ -287,7 +280,8 @@ def _robot() -> str:
     ]
     pad_contact = '<contact><lateral_friction value="1"/><spinning_friction value="0.001"/></contact>'
     for side, sign in (("left", 1), ("right", -1)):
-        pad = _box((-0.0093, 0.0093), tuple(sorted((sign * 0.0009, sign * 0.0049))), (0.0707, 0.0957), BLACK)  # type: ignore[arg-type]
+        near, far = sorted((sign * 0.0009, sign * 0.0049))
+        pad = _box((-0.0093, 0.0093), (near, far), (0.0707, 0.0957), BLACK)
         extra.append(_joint(f"joint_finger_tip_{side}", f"finger_{side}_tip", (0, 0, 0), parent=f"panda_{side}finger"))
         extra.append(_link(f"finger_{side}_tip", 1e-4, pad, pad_contact))
     for element in extra:

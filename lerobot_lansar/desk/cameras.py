@@ -1,4 +1,4 @@
-"""CALVIN's two cameras (`spec`: eye, target, field of view of calvin_env's config)."""
+"""CALVIN's two cameras; eye, target and field of view are those of calvin_env's configuration."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,14 @@ from ..calvin import CAMERAS
 
 
 @dataclass(frozen=True)
-class Camera:
-    """Intrinsics of one camera: picture size (pixels, square), vertical field of view (degrees), clip planes (m)."""
+class Intrinsics:
+    """How a camera sees.
+
+    Attributes:
+        size: Width and height of its pictures, pixels.
+        fov: Vertical field of view, degrees.
+        near, far: Clip planes: what is nearer or farther is not drawn, m.
+    """
 
     size: int
     fov: float
@@ -19,8 +25,8 @@ class Camera:
 
 
 INTRINSICS = {
-    "static": Camera(size=CAMERAS["static"], fov=10.0, near=0.01, far=10.0),
-    "gripper": Camera(size=CAMERAS["gripper"], fov=75.0, near=0.01, far=2.0),
+    "static": Intrinsics(size=CAMERAS["static"], fov=10.0, near=0.01, far=10.0),
+    "gripper": Intrinsics(size=CAMERAS["gripper"], fov=75.0, near=0.01, far=2.0),
 }
 
 STATIC_EYE = (2.871459009488717, -2.166602199425597, 2.555159848480571)
@@ -34,7 +40,7 @@ def static_view() -> np.ndarray:
 
 
 def gripper_view(position: np.ndarray, orientation: np.ndarray) -> np.ndarray:
-    """World to eye of the gripper camera, (4, 4), from its link's pose: it looks along +y with -z up.
+    """World to eye of the gripper camera, (4, 4), from its link's pose; it looks along the link's +y with -z up.
 
     Args:
         position: (3,) m, world frame.

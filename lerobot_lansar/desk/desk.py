@@ -10,20 +10,20 @@ import numpy as np
 import pybullet as p
 
 from ..calvin import CAMERAS, COLORS, FURNITURE, block_pose
-from .assets import Assets, open_assets
+from .assets import Assets, find_assets
 from .cameras import INTRINSICS, gripper_view, static_view
 from .errors import DeskError, SimulationError
-from .furniture import Table, load_blocks
+from .furniture import Furniture, load_blocks
 from .oracle import BlockState, Snapshot, Touch, completed_tasks
-from .render import RENDERERS, Preparation, Renderer
+from .render import RENDERERS, Renderer, load_egl, open_renderer
 from .robot import Robot
-from .scenes import Scene, get_scene
+from .scenes import TABLE_Z, Scene, get_scene
 
 SUBSTEPS = 8
 """Simulation steps of 1/240 s per control step of 1/30 s."""
 
-LARGEST = 100.0
-"""No number of an action or a state may be larger: relative units, metres or radians."""
+MAX_MAGNITUDE = 100.0
+"""Largest absolute value accepted in an action or state."""
 
 Observation = dict[str, np.ndarray]
 
@@ -32,7 +32,7 @@ _PARKING = 100.0  # where blocks wait while contact caches are cleared (m)
 
 @dataclass(frozen=True)
 class SavedState:
-    """How a desk came to where it was: the state it was reset to and the actions since. It can be pickled."""
+    """A resumable state: the reset state and all actions since. It can be pickled."""
 
     scene: str
     assets: str
@@ -46,16 +46,20 @@ class Desk:
 
     `robot_obs` (15,) float64 is CALVIN's: TCP xyz (m), TCP euler xyz (rad), gripper opening width (m), seven arm
     joints (rad), last gripper action (-1 close, +1 open). `scene_obs` (24,) float64: slide, drawer, button, switch
-    joints (m), light bulb, LED (0/1), then xyz (m) and euler xyz (rad) of the red, the blue and the pink block: this
-    order in every scene, whereas CALVIN's own files follow each scene's configuration.
+    joints (m), light bulb, LED (0/1), then xyz (m) and euler xyz (rad) of the red, the blue and the pink block. Blocks
+    have this order in every scene; in CALVIN's own files the order depends on the scene.
 
     Args:
         scene: `"A"`, `"B"`, `"C"`, `"D"`, or `"D_eval"`: D with calvin_env's fixed evaluation layout.
         assets: None for the built-in desk, or the `data` folder of a calvin_env checkout for the original files.
-        cameras: Pictures that observations hold: any of `"static"` (200x200) and `"gripper"` (84x84).
-        renderer: `"fast"` (ours, in TinyRenderer's look), `"fast_gl"` (ours, in the OpenGL look of CALVIN's public
-            data), `"tiny"` or `"egl"` (PyBullet's own). It is set up when the first picture is asked for.
-        depth: Observations also hold `depth_<camera>`.
+        cameras: Cameras whose pictures observations hold: any of `"static"` (200x200) and `"gripper"` (84x84).
+        renderer: `"fast"` (ours, with TinyRenderer's look), `"fast_gl"` (ours, with the OpenGL look of CALVIN's public
+            data), `"tiny"` or `"egl"` (PyBullet's own). It is set up when the first picture is drawn.
+        depth: Whether observations also hold `depth_<camera>`.
+
+    Attributes:
+        scene: The scene's numbers.
+        assets: `"built-in"` or `"original"`.
 
     Raises:
         DeskError: Unknown scene, camera or renderer, missing asset files, no driver for `egl`.
@@ -90,36 +94,31 @@ class Desk:
         """Starts a Bullet client and loads all bodies."""
         self._renderer: Renderer | None = None
         self._diverged = False
-        with open_assets(self.scene, self._assets_folder) as files:
-            self.assets = files.kind
-            self._client = p.connect(p.DIRECT)
-            self._require_open()
-            try:
-                self._load(files)
-            except BaseException:
-                self.close()
-                raise
+        files = find_assets(self.scene, self._assets_folder)
+        self.assets = files.kind
+        self._client = p.connect(p.DIRECT)
+        self._require_open()
+        try:
+            self._load(files)
+        except BaseException:
+            self.close()
+            raise
 
     def _load(self, files: Assets) -> None:
         client = self._client
-        self._pictures = Preparation(self.renderer, client)
-        if files.temporary:  # Bullet would remember every file by its ever new name
-            p.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
+        self._egl_plugin = load_egl(client) if self.renderer == "egl" else None  # it draws only what is loaded later
         p.setGravity(0, 0, -9.8, physicsClientId=client)
         self._robot = Robot(client, files)
         self._blocks = load_blocks(client, files, self.scene)
-        self._table = Table(client, files)
+        self._furniture = Furniture(client, files)
         plane = p.loadURDF(str(files.plane), physicsClientId=client)
-        # Only after loading: earlier it is lost and the motion depends on how the bodies came in.
+        # only after loading: before, it has no effect and the motion depends on how the bodies were loaded
         p.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        self._names = {self._robot.body: "robot", self._table.body: "desk", plane: "plane"}
+        self._names = {self._robot.body: "robot", self._furniture.body: "desk", plane: "plane"}
         self._names |= {block.body: color for color, block in self._blocks.items()}
-        self._desk_links = {index: name for name, index in self._table.links.items()}
-        self._pictures.loaded(files.temporary)
-        if files.temporary:
-            p.setPhysicsEngineParameter(enableFileCaching=1, physicsClientId=client)
+        self._desk_links = {index: name for name, index in self._furniture.links.items()}
 
-    # ---- what users call
+    # ---- public
 
     def reset(
         self,
@@ -127,24 +126,25 @@ class Desk:
         scene_obs: Sequence[float] | np.ndarray | None = None,
         seed: int | None = 0,
     ) -> Observation:
-        """Puts the desk into a state; nothing of what happened before remains.
+        """Puts the desk into a state; nothing that happened before has any influence.
 
         Args:
-            robot_obs: (15,) joints, opening width and gripper action are used; None: CALVIN's home pose, hand open.
-            scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks placed at
-                random by `seed` as CALVIN does, or where the scene's layout has them.
-            seed: Decides the blocks' places when `scene_obs` is None.
+            robot_obs: (15,), of which joints, opening width and gripper action are used; None: CALVIN's home pose,
+                hand open.
+            scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks at random
+                as in CALVIN, or where the scene's layout puts them.
+            seed: Determines the blocks' random poses; None: other ones every time.
 
         Returns:
             The observation after one simulation step, as in CALVIN.
 
         Raises:
-            DeskError: A state of the wrong length, with a value that is not finite, or over `LARGEST`.
+            DeskError: A state has the wrong shape, or a value that is not finite or exceeds `MAX_MAGNITUDE`.
         """
         self._require_open()
         robot_state = None if robot_obs is None else _vector(robot_obs, 15, "robot_obs")
         scene_state = self._random_scene(seed) if scene_obs is None else _vector(scene_obs, 24, "scene_obs")
-        if self._diverged:  # what is not finite stays in Bullet's caches
+        if self._diverged:  # Bullet's caches would keep the values that are not finite
             self.close()
             self._open()
         self._clear_contacts()
@@ -158,13 +158,14 @@ class Desk:
 
         Args:
             action: (7,). `"rel"`: TCP translation in units of 0.02 m, rotation (euler) in units of 0.05 rad, both
-                added to a target pose that is kept from step to step. `"abs"`: TCP xyz (m) and euler xyz (rad).
-                Last number in both: the gripper opens if it is positive, closes otherwise.
+                added to a target pose that is kept from step to step; values beyond +-1 are not clipped, as in CALVIN.
+                `"abs"`: TCP xyz (m) and euler xyz (rad). In both the gripper opens if the last number is positive and
+                closes otherwise.
             control_mode: `"rel"` or `"abs"`.
 
         Raises:
-            DeskError: Unknown mode; an action of the wrong shape, with a value that is not finite, or over
-                `LARGEST`. Relative actions beyond 1 are executed as they are, as in CALVIN.
+            DeskError: The mode is unknown, or the action has the wrong shape, or a value that is not finite or
+                exceeds `MAX_MAGNITUDE`.
             SimulationError: The physics diverged; reset before going on.
         """
         self._require_open()
@@ -174,18 +175,18 @@ class Desk:
         return self.observe()
 
     def save(self) -> SavedState:
-        """Remembers the present state for `restore`, here or on another desk of the same scene and assets."""
+        """The present state for `restore`, on this desk or another one with the same scene and assets."""
         self._require_open()
         return replace(self._history, actions=tuple(self._actions))
 
     def restore(self, state: SavedState) -> Observation:
-        """Goes back to a saved state; the same actions then lead to the same states, bit for bit.
+        """Goes back to a saved state; from there the same actions lead to the same states, bit for bit.
 
-        Bullet's own saved states miss what its contact solver remembers, so this resets and repeats the actions: about
-        1 ms for each.
+        Bullet's own saved states lack the memory of its contact solver, so this resets the desk and repeats the
+        actions: about 1 ms each.
 
         Raises:
-            DeskError: The state belongs to another scene or to other assets.
+            DeskError: The state was saved with another scene or other assets.
         """
         if (state.scene, state.assets) != (self.scene.name, self.assets):
             raise DeskError(
@@ -198,8 +199,11 @@ class Desk:
         return self.observe()
 
     def observe(self) -> Observation:
-        """The present state: `robot_obs`, `scene_obs` and, per camera, `rgb_<camera>` (size, size, 3) uint8 and,
-        if the desk was made with `depth`, `depth_<camera>` (size, size) float32 m.
+        """The present state: `robot_obs`, `scene_obs`, and per camera `rgb_<camera>` (size, size, 3) uint8 and, with
+        `depth`, `depth_<camera>` (size, size) float32 m.
+
+        Raises:
+            SimulationError: The physics diverged; reset before going on.
         """
         self._require_open()
         obs = {"robot_obs": self._robot.observe(), "scene_obs": self._scene_obs()}
@@ -207,9 +211,9 @@ class Desk:
             self._diverged = True
             raise SimulationError("the simulation diverged: a state is no longer finite; reset the desk to go on")
         for camera in self.cameras:
-            obs[f"rgb_{camera}"], inverse = self._draw(camera)
+            obs[f"rgb_{camera}"], inverse_depth = self._draw(camera)
             if self.depth:
-                obs[f"depth_{camera}"] = _distance(camera, inverse)
+                obs[f"depth_{camera}"] = _depth(camera, inverse_depth)
         return obs
 
     def render(self, camera: str = "static", size: int | None = None) -> np.ndarray:
@@ -217,11 +221,11 @@ class Desk:
         return self._draw(camera, size)[0]
 
     def render_depth(self, camera: str = "static", size: int | None = None) -> np.ndarray:
-        """Distance along the camera's axis, (size, size) float32 m; the camera's far plane where there is nothing."""
-        return _distance(camera, self._draw(camera, size)[1])
+        """Distance along the camera's axis, (size, size) float32 m; where there is nothing, that of the far plane."""
+        return _depth(camera, self._draw(camera, size)[1])
 
     def snapshot(self) -> Snapshot:
-        """What the task oracle needs of the present state."""
+        """The present state as the task oracle needs it."""
         self._require_open()
         contacts: dict[str, set[Touch]] = {name: set() for name in ("robot", *COLORS)}
         for contact in p.getContactPoints(physicsClientId=self._client) or ():
@@ -229,24 +233,24 @@ class Desk:
             for this, other in ((a, b), (b, a)):
                 if this[0] in contacts:
                     contacts[this[0]].add(other)
-        slide, drawer, _, _ = self._table.joints()
+        slide, drawer, _, _ = self._furniture.joints()
         return Snapshot(
             slide=slide,
             drawer=drawer,
-            bulb=self._table.bulb,
-            led=self._table.led,
+            bulb=self._furniture.bulb,
+            led=self._furniture.led,
             blocks={color: self._block_state(color, frozenset(contacts[color])) for color in COLORS},
             touched_by_robot=frozenset(body for body, _ in contacts["robot"]),
         )
 
     def completed_tasks(self, start: Snapshot) -> set[str]:
-        """Names of CALVIN's tasks that are fulfilled between `start` and now."""
+        """Names of the tasks that are fulfilled between `start` and now."""
         return completed_tasks(start, self.snapshot())
 
     def solve_ik(self, position: Any, euler: Any, rounds: int = 40) -> np.ndarray:
-        """Arm joints (7,) rad that bring the TCP to a pose, found by repeating Bullet's IK; moves the arm there.
+        """Arm joints (7,) rad that bring the TCP to a pose, found by repeating Bullet's IK.
 
-        Meant for choosing a start state between episodes: it leaves the arm displaced, so reset the desk afterwards.
+        It moves the arm: use it between episodes, to choose a start state, and reset the desk afterwards.
         """
         for _ in range(rounds):
             joints = self._robot.joints_for(np.asarray(position), np.asarray(euler))
@@ -266,35 +270,36 @@ class Desk:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # ---- inside
+    # ---- private
 
     def _require_open(self) -> None:
         if self._client < 0:
             raise DeskError("this desk is closed, or Bullet had no client left for it; make a new one")
 
     def _draw(self, camera: str, size: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """A picture and 1 / distance."""
+        """A picture (size, size, 3) uint8 and its inverse depth (size, size) float32, 1/m."""
         self._require_open()
         _check_cameras((camera,))
         if self._renderer is None:
-            self._renderer = self._pictures.open(self._table.light_colors())
-        still = camera == "static"
-        view = static_view() if still else gripper_view(*self._robot.camera_pose())
-        lens = INTRINSICS[camera]
-        pixels = lens.size if size is None else size
+            lights = self._furniture.light_colors()
+            self._renderer = open_renderer(self.renderer, self._client, lights, self._egl_plugin)
+        fixed = camera == "static"
+        view = static_view() if fixed else gripper_view(*self._robot.camera_pose())
+        intrinsics = INTRINSICS[camera]
+        pixels = intrinsics.size if size is None else size
         if not isinstance(pixels, int | np.integer) or pixels < 1:
             raise DeskError(f"size must be a positive number of pixels, got {size!r}")
-        return self._renderer.draw(lens, view, int(pixels), self._table.light_colors(), keep=still)
+        return self._renderer.draw(intrinsics, view, int(pixels), self._furniture.light_colors(), fixed)
 
     def _advance(self, action: np.ndarray, control_mode: str) -> None:
         self._actions.append((action, control_mode))
         self._robot.command(action, relative=control_mode == "rel")
         for _ in range(SUBSTEPS):
             p.stepSimulation(physicsClientId=self._client)
-        self._table.update_lights()
+        self._furniture.update_lights()
 
     def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
-        self._table.reset(scene_state[FURNITURE])
+        self._furniture.reset(scene_state[FURNITURE])
         for index, color in enumerate(COLORS):
             pose = scene_state[block_pose(index)]
             self._blocks[color].place(pose[:3], pose[3:])
@@ -302,15 +307,15 @@ class Desk:
         p.stepSimulation(physicsClientId=self._client)
 
     def _clear_contacts(self) -> None:
-        """Bullet keeps contacts over a reset; a step with everything apart makes it forget them."""
+        """One step with all bodies apart: without it, Bullet keeps contacts across a reset."""
         self._robot.reset(None)
-        self._table.reset(np.zeros(6))
+        self._furniture.reset(np.zeros(6))
         for index, block in enumerate(self._blocks.values()):
             block.place((_PARKING + index, 0, _PARKING), (0, 0, 0))
         p.stepSimulation(physicsClientId=self._client)
 
     def _scene_obs(self) -> np.ndarray:
-        return np.concatenate([self._table.observe(), *(self._blocks[c].observe() for c in COLORS)])
+        return np.concatenate([self._furniture.observe(), *(self._blocks[c].observe() for c in COLORS)])
 
     def _block_state(self, color: str, contacts: frozenset[Touch]) -> BlockState:
         block = self._blocks[color]
@@ -328,7 +333,7 @@ class Desk:
         return name, self._desk_links[link] if name == "desk" else ""
 
     def _random_scene(self, seed: int | None) -> np.ndarray:
-        """Everything closed and off; blocks as the scene's layout says, or at random, no two of them touching."""
+        """Everything closed and off; blocks as in the scene's layout, or at random, no two of them touching."""
         if self.scene.layout is not None:
             return np.array([0.0] * 6 + [x for color in COLORS for x in self.scene.layout[color]])
         rng = np.random.default_rng(seed)
@@ -337,7 +342,8 @@ class Desk:
             poses = []
             for _ in COLORS:
                 area = areas[rng.integers(len(areas))]
-                poses.append([rng.uniform(*area.x), rng.uniform(*area.y), 0.46, 0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+                x, y, yaw = rng.uniform(*area.x), rng.uniform(*area.y), rng.uniform(-np.pi, np.pi)
+                poses.append([x, y, TABLE_Z, 0.0, 0.0, yaw])
             # the longest block's half diagonal is 0.045 m
             if all(np.hypot(a[0] - b[0], a[1] - b[1]) > 0.09 for a, b in itertools.combinations(poses, 2)):
                 return np.array([0.0] * 6 + [x for pose in poses for x in pose])
@@ -349,9 +355,9 @@ def _check_cameras(cameras: Sequence[str]) -> None:
             raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
 
 
-def _distance(camera: str, inverse: np.ndarray) -> np.ndarray:
+def _depth(camera: str, inverse_depth: np.ndarray) -> np.ndarray:
     far = np.float32(INTRINSICS[camera].far)
-    return 1 / np.maximum(inverse, 1 / far)
+    return 1 / np.maximum(inverse_depth, 1 / far)
 
 
 def _vector(values: Any, length: int, name: str) -> np.ndarray:
@@ -363,6 +369,6 @@ def _vector(values: Any, length: int, name: str) -> np.ndarray:
         raise DeskError(f"{name} must have shape ({length},), got {array.shape}")
     if not np.isfinite(array).all():
         raise DeskError(f"{name} must be finite, got {array.tolist()}")
-    if np.abs(array).max() > LARGEST:
-        raise DeskError(f"{name} must lie within +-{LARGEST:g} in every component, got {array.tolist()}")
+    if np.abs(array).max() > MAX_MAGNITUDE:
+        raise DeskError(f"{name} must lie within +-{MAX_MAGNITUDE:g} in every component, got {array.tolist()}")
     return array

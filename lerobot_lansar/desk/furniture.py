@@ -1,4 +1,4 @@
-"""What stands around the arm: the desk with its joints and lights, and the three blocks."""
+"""What the arm works on: the desk with its joints and lights, and the three blocks."""
 
 from typing import Any
 
@@ -12,12 +12,13 @@ OFF = (1.0, 1.0, 1.0, 1.0)
 LED_ON = (0.0, 1.0, 0.0, 1.0)
 BULB_ON = (1.0, 1.0, 0.0, 1.0)
 JOINT_FORCE = 4.0
+"""Force (N) with which motors brake the slide, the drawer and the switch, and push the button back up."""
 JOINTS = ("slide", "drawer", "button", "switch")
 """The desk's joints in the order of `scene_obs`."""
 
 
-class Table:
-    """The desk: slide, drawer, button and switch joints, light bulb and LED.
+class Furniture:
+    """The desk's slide, drawer, button and switch joints, light bulb and LED.
 
     Attributes:
         body: Bullet body id.
@@ -38,13 +39,9 @@ class Table:
             p.setJointMotorControl2(
                 self.body, self._joints[name], p.VELOCITY_CONTROL, force=JOINT_FORCE, physicsClientId=client
             )
+        button = self._joints["button"]
         p.setJointMotorControl2(
-            self.body,
-            self._joints["button"],
-            p.POSITION_CONTROL,
-            targetPosition=0,
-            force=JOINT_FORCE,
-            physicsClientId=client,
+            self.body, button, p.POSITION_CONTROL, targetPosition=0, force=JOINT_FORCE, physicsClientId=client
         )
         self.bulb = self.led = False
         self._was_pressed = self._was_on = False
@@ -55,14 +52,14 @@ class Table:
         return [state[0] for state in p.getJointStates(self.body, indices, physicsClientId=self.client)]
 
     def reset(self, state: np.ndarray) -> None:
-        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the head of `scene_obs`."""
+        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the first part of `scene_obs`."""
         for name, value in zip(JOINTS, state[:4], strict=True):
             p.resetJointState(self.body, self._joints[name], value, physicsClientId=self.client)
         self.bulb, self.led = bool(state[4] > 0.5), bool(state[5] > 0.5)
         self._was_pressed = self._was_on = False
 
     def update_lights(self) -> None:
-        """Called once per control step: a new press toggles the LED, a moved switch sets the bulb."""
+        """A new press of the button toggles the LED, a moved switch sets the bulb; to be called every control step."""
         _, _, button, switch = self.joints()
         pressed = button > BUTTON_TRAVEL / 2
         if pressed and not self._was_pressed:
@@ -74,14 +71,14 @@ class Table:
         self._was_on = on
 
     def light_colors(self) -> dict[tuple[int, int], tuple[float, ...]]:
-        """rgba of LED and bulb as they are now, by (body, link)."""
+        """(body, link) of the LED and of the bulb to their present rgba, 0 to 1."""
         return {
             (self.body, self.links["led_link"]): LED_ON if self.led else OFF,
             (self.body, self.links["light_link"]): BULB_ON if self.bulb else OFF,
         }
 
     def observe(self) -> np.ndarray:
-        """The first six numbers of `scene_obs`: (6,) float64."""
+        """The first part of `scene_obs`: (6,) float64."""
         return np.array([*self.joints(), float(self.bulb), float(self.led)])
 
 
@@ -94,7 +91,7 @@ class Block:
         self.body = p.loadURDF(str(assets.blocks[color]), globalScaling=assets.scale, physicsClientId=client)
 
     def place(self, position: Any, euler: Any) -> None:
-        """Puts the block at `position` (3,) m with `euler` (3,) rad, at rest."""
+        """Puts the block at `position` (3,) m with angles `euler` (3,) rad, at rest."""
         p.resetBasePositionAndOrientation(
             self.body, position, p.getQuaternionFromEuler(euler), physicsClientId=self.client
         )
@@ -114,5 +111,5 @@ class Block:
 
 
 def load_blocks(client: int, assets: Assets, scene: Scene) -> dict[str, Block]:
-    """Loads the blocks in the scene's original order, which fixes Bullet's body ids."""
+    """Loads the blocks in CALVIN's order for the scene, so that Bullet's body ids are the original's."""
     return {color: Block(client, assets, color) for color in scene.blocks}

@@ -1,7 +1,7 @@
 """CALVIN's success oracle: which of the 34 tasks were fulfilled between two moments.
 
-A task is a relation between the state when a command began and the state now. Both are `Snapshot`: plain data,
-so the oracle needs no simulator. Contacts name what is touched: `("robot", "")`, `("desk", <link>)`,
+A task compares the state in which a command began with the state now. Both are a `Snapshot`: plain data, so the
+oracle needs no simulator. A contact is named by the body and link touched: `("robot", "")`, `("desk", <link>)`,
 `("plane", "")` or `(<block colour>, "")`.
 """
 
@@ -14,15 +14,16 @@ from scipy.spatial.transform import Rotation
 from ..calvin import COLORS, TASKS, Task
 
 Touch = tuple[str, str]
+"""Body and link that a block or the robot touches."""
 
 TABLE, PLANK, DRAWER = ("desk", "base_link"), ("desk", "plank_link"), ("desk", "drawer_link")
 AT_REST = 1.0
-"""Every component of a block's linear (m/s) and angular (rad/s) velocity stays under this while it is stacked."""
+"""A block rests if all components of its linear (m/s) and angular (rad/s) velocity are below this."""
 
 
 @dataclass(frozen=True)
 class BlockState:
-    """Position (3,) m, orientation xyzw (4,), velocities (3,) m/s and rad/s, and what the block touches."""
+    """One block: position (3,) m, quaternion xyzw (4,), velocities (3,) m/s and (3,) rad/s, contacts."""
 
     position: np.ndarray
     orientation: np.ndarray
@@ -42,7 +43,7 @@ class BlockState:
 
     @property
     def resting(self) -> bool:
-        """No velocity component reaches `AT_REST`."""
+        """Whether every component of its velocities is below `AT_REST`."""
         return bool(np.all(np.abs([self.linear_velocity, self.angular_velocity]) < AT_REST))
 
 
@@ -66,7 +67,7 @@ class Snapshot:
 
 
 Condition = Callable[[Snapshot, Snapshot], bool]
-"""Whether a task is fulfilled, of the snapshots at its start and now."""
+"""Whether a task is fulfilled, given the snapshots at its start and now."""
 
 
 def _rotate(color: str, degrees: float) -> Condition:
@@ -115,10 +116,8 @@ def _place(surface: Touch) -> Condition:
 
 
 def _push_into_drawer(start: Snapshot, end: Snapshot) -> bool:
-    # The hand may still touch the block at the end: the original's recorded verdicts say so.
-    return any(
-        start.blocks[color].contacts == {TABLE} and DRAWER in end.blocks[color].contacts for color in start.blocks
-    )
+    # the hand may still touch the block at the end, as in the original
+    return any(start.blocks[c].contacts == {TABLE} and DRAWER in end.blocks[c].contacts for c in COLORS)
 
 
 def is_stacked(block: BlockState) -> bool:
@@ -153,11 +152,11 @@ def _light(name: str, on: bool) -> Condition:
 
 
 SURFACES: dict[str | None, Touch] = {"table": TABLE, "slider": PLANK, "drawer": DRAWER}
-"""A task's place to the part of the desk that blocks lie on there."""
+"""`Task.place` to the part of the desk on which blocks lie there."""
 
 
 def _condition(task: Task) -> Condition:
-    """CALVIN's condition of a task, with its thresholds in metres and degrees."""
+    """CALVIN's condition for a task, with its thresholds in metres and degrees."""
     color, sign = str(task.color), 1 if task.side == "right" else -1
     conditions: dict[str, Callable[[], Condition]] = {
         "rotate_block": lambda: _rotate(color, -60 * sign),

@@ -12,11 +12,14 @@ BASE_POSITION = (-0.34, -0.46, 0.24)
 HOME_JOINTS = (-1.21779206, 1.03987646, 2.11978261, -2.34205014, -0.87015947, 1.64119353, 0.55344866)
 ARM = tuple(range(7))
 FINGERS = (9, 11)
-FINGER_OPEN = 0.04
 TCP_LINK = 15
 CAMERA_LINK = 14
+"""Bullet's joint and link indices, the same with both kinds of assets."""
+FINGER_OPEN = 0.04
+"""Joint value of each finger when the hand is open (m)."""
 ARM_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 ARM_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+"""The arm's joint limits (rad)."""
 
 _IK = {
     "lowerLimits": [-7.0] * 9,
@@ -67,7 +70,7 @@ class Robot:
     def reset(self, robot_obs: np.ndarray | None) -> None:
         """Sets the arm's joints and half the opening width for each finger; the TCP part of `robot_obs` is ignored.
 
-        The relative mode's target becomes the TCP pose reached here.
+        The target that relative actions move starts at the resulting TCP pose.
         """
         joints = HOME_JOINTS if robot_obs is None else robot_obs[ARM_JOINTS]
         finger = FINGER_OPEN if robot_obs is None else robot_obs[GRIPPER_WIDTH] / 2
@@ -83,9 +86,9 @@ class Robot:
         self._target_euler = np.array(p.getEulerFromQuaternion(orientation))
 
     def command(self, action: np.ndarray, relative: bool) -> None:
-        """Sets the motors' targets from a (7,) action; the simulation is stepped by the desk.
+        """Sets the motors' targets from an action (7,).
 
-        In relative mode the action moves a target that is kept from step to step and never re-anchored to the arm.
+        A relative action moves a target pose that is kept from step to step and never set back to the arm's pose.
         """
         if relative:
             self._target_position += action[:3] * POSITION_UNIT
@@ -101,7 +104,7 @@ class Robot:
             self._drive(joint, FINGER_OPEN if opening else 0.0, force=2 if opening else 200, max_velocity=1)
 
     def joints_for(self, position: np.ndarray, euler: np.ndarray) -> np.ndarray:
-        """One call of Bullet's null-space IK from the current joints, clipped to the real limits: (7,) rad."""
+        """Arm joints (7,) rad for a TCP pose: one call of Bullet's null-space IK, clipped to the joint limits."""
         solution = p.calculateInverseKinematics(
             self.body,
             TCP_LINK,
@@ -110,7 +113,7 @@ class Robot:
             physicsClientId=self.client,
             **_IK,
         )
-        return np.clip(solution[:7], ARM_LOWER, ARM_UPPER)
+        return np.clip(solution[: len(ARM)], ARM_LOWER, ARM_UPPER)
 
     def _drive(self, joint: int, target: float, force: float, max_velocity: float) -> None:
         p.setJointMotorControl2(
@@ -124,11 +127,11 @@ class Robot:
         )
 
     def tcp_pose(self) -> tuple[Any, Any]:
-        """TCP position (3,) m and quaternion xyzw (4,), one simulation step old during motion, as CALVIN reads it."""
+        """TCP position (3,) m and quaternion xyzw (4,); in motion one simulation step old, as in CALVIN."""
         return p.getLinkState(self.body, TCP_LINK, physicsClientId=self.client)[:2]
 
     def camera_pose(self) -> tuple[Any, Any]:
-        """Pose of the gripper camera's link, as old as `tcp_pose`."""
+        """Position (3,) m and quaternion xyzw (4,) of the gripper camera's link, as old as `tcp_pose`."""
         return p.getLinkState(self.body, CAMERA_LINK, physicsClientId=self.client)[:2]
 
     def observe(self) -> np.ndarray:

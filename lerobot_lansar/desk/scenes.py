@@ -1,4 +1,4 @@
-"""The four CALVIN scenes as data: where each fixed object sits, which blocks lie about and where they start.
+"""The four CALVIN scenes as data: where the desk's parts are, how large the blocks are and where they start.
 
 Everything is in metres in the world frame, after CALVIN's global scaling of 0.8. The four desks are the same piece
 of furniture with its parts in different places, so a scene is a handful of numbers.
@@ -10,14 +10,29 @@ from ..calvin import BLOCK_ORDER
 from .errors import DeskError
 
 BLOCK_LENGTHS = {"small": 0.04, "middle": 0.056, "big": 0.08}
-"""A block's extent along its own x axis (m); its other two sides are 0.04 m."""
-
+"""A block's extent along its own x axis (m); its other two sides are `BLOCK_SIDE`."""
 BLOCK_SIDE = 0.04
+
+TABLE_Z = 0.46
+"""Height of a block's centre on the table and on the cabinet's floor (m)."""
+DRAWER_Z = 0.362
+"""Height of a block's centre in the drawer (m)."""
+REACH = 0.41
+"""Blocks can be pushed up to this |x| and still lie on the table, which ends at 0.44 (m)."""
+
+BUTTON_Y = -0.12
+"""World y of the button in every scene (m)."""
+DOOR_WIDTH = 0.28
+"""Width of the cabinet's sliding door (m); its left edge is at the scene's `slide_x` minus the joint."""
+
+DRAWER_TRAVEL = 0.22
+SWITCH_TRAVEL = 0.088
+BUTTON_TRAVEL = 0.02
 
 
 @dataclass(frozen=True)
 class Area:
-    """A horizontal rectangle in which block centres start (m), at a height of 0.46."""
+    """A horizontal rectangle in which block centres start, at a height of `TABLE_Z` (m)."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -29,14 +44,13 @@ class Scene:
 
     Attributes:
         name: The letter by which users call it.
-        blocks: Colour to block variant (small, middle, big), in the scene's ORIGINAL order: the order in which
-            CALVIN loads the blocks and writes them into its files (A and C differ from red, blue, pink).
+        blocks: Colour to block size (small, middle, big), in CALVIN's order for this scene (`calvin.BLOCK_ORDER`).
         areas: Where blocks start, by CALVIN's names.
         button_x, switch_x, light_x, led_x, slide_x, drawer_x: World x of each part at joint value 0.
-        cabinet: World x range of the open cabinet, whose floor is the plank.
+        cabinet: World x range of the cabinet's inside; its floor is the link `plank_link`.
         slide_travel: Upper limit of the sliding door (m).
         wood, dark_wood, metal: Colours (rgb in [0, 1]) of the built-in desk.
-        layout: Where each block starts: xyz (m), euler (rad); None: at random in `areas`.
+        layout: Colour to the pose that the block starts in, xyz (m) and euler (rad); None: at random in `areas`.
     """
 
     name: str
@@ -56,19 +70,12 @@ class Scene:
     layout: dict[str, tuple[float, ...]] | None = None
 
 
-BUTTON_Y = -0.12
-"""World y of the button (m) in every scene."""
-
-DRAWER_TRAVEL = 0.22
-SWITCH_TRAVEL = 0.088
-BUTTON_TRAVEL = 0.02
-
 _BEHIND = (0.05, 0.12)
 _FRONT = (-0.15, -0.03)
 
 
-def _blocks(name: str, **variants: str) -> dict[str, str]:
-    return {color: variants[color] for color in BLOCK_ORDER[name]}
+def _blocks(name: str, **sizes: str) -> dict[str, str]:
+    return {color: sizes[color] for color in BLOCK_ORDER[name]}
 
 
 def _areas(table: tuple[float, float], left: tuple[float, float], right: tuple[float, float]) -> dict[str, Area]:
@@ -148,15 +155,21 @@ SCENES = {
 
 
 EVALUATION_LAYOUT: dict[str, tuple[float, ...]] = {
-    "red": (0.05, -0.12, 0.46, 0.0, 0.0, 1.57),
+    "red": (0.05, -0.12, TABLE_Z, 0.0, 0.0, 1.57),
     "blue": (0.05, -0.12, 0.51, 0.0, 0.0, 0.0),
-    "pink": (0.10, 0.08, 0.46, 0.0, 0.0, 1.57),
+    "pink": (0.10, 0.08, TABLE_Z, 0.0, 0.0, 1.57),
 }
 """Where calvin_env's evaluation configuration of scene D puts the blocks (m, rad); blue falls on red."""
 
 
+def beside_door(scene: Scene, slide: float, x: float) -> bool:
+    """Whether a finger fits between the door's edge and a block whose middle is at `x` in the cabinet: 0.045 m."""
+    door = scene.slide_x - slide
+    return bool(x < door - 0.045 or x > door + DOOR_WIDTH + 0.045)
+
+
 def get_scene(name: str) -> Scene:
-    """The scene called `name`: A, B, C, D, or `D_eval` for D with the blocks in `EVALUATION_LAYOUT`.
+    """The scene called `name`: A, B, C, D, or `D_eval`, which is D with the blocks in `EVALUATION_LAYOUT`.
 
     Raises:
         DeskError: There is no such scene.

@@ -1,9 +1,8 @@
-"""What people say: a small grammar of commands for each of the 34 tasks, or sentences from a user's file.
+"""Commands in words: a small grammar for each of the 34 tasks, or sentences from a user's file.
 
-A task's sentences come in two sets that share none: *training* ones, with which demonstrations are labelled, and
-*validation* ones, held out for evaluation, as CALVIN does it. They start from the example commands in Table 4.1 of the
-thesis. Colour and direction are filled in from the task's name; that place words and opposites (open, close; on, off)
-are right is tested.
+Each task has two disjoint sets of sentences, as in CALVIN: *training* sentences label demonstrations, *validation*
+sentences are held out for evaluation. They start from the example commands in Table 4.1 of the thesis. Colour and
+side are filled in from the task; tests check the words for places and opposites (open, close; on, off).
 """
 
 import itertools
@@ -203,13 +202,13 @@ _GRAMMAR: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
 }
-"""Task to patterns of training and of validation sentences; `(a|b|)` stands for one of a, b and nothing."""
+"""Task to its patterns of training and of validation sentences; `(a|b|)` stands for a, b or nothing."""
 
 _ALTERNATIVES = re.compile(r"\(([^()]*)\)")
 
 
 def expand(pattern: str) -> list[str]:
-    """All sentences of a pattern, in order.
+    """All sentences that a pattern stands for, in order.
 
     >>> expand("(open|pull) the (|top )drawer")
     ['open the drawer', 'open the top drawer', 'pull the drawer', 'pull the top drawer']
@@ -221,31 +220,31 @@ def expand(pattern: str) -> list[str]:
     return [s for choice in inner[1].split("|") for s in expand(before + choice + after)]
 
 
-def _sentences(kind: int) -> dict[str, list[str]]:
+def _sentences(split: int) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name, patterns in _GRAMMAR.items():
         colors = COLORS if "{color}" in name else ("",)
         sides = ("left", "right") if "{side}" in name else ("",)
         for color, side in itertools.product(colors, sides):
-            filled = (pattern.format(color=color, side=side) for pattern in patterns[kind])
+            filled = (pattern.format(color=color, side=side) for pattern in patterns[split])
             listed = dict.fromkeys(sentence for pattern in filled for sentence in expand(pattern))
             found[name.format(color=color, side=side)] = list(listed)
     return {task: found[task] for task in TASKS}
 
 
 COMMANDS: dict[str, dict[str, list[str]]] = {"training": _sentences(0), "validation": _sentences(1)}
-"""Split to task to sentences. Evaluations use a task's first validation sentence."""
+"""Split to task to sentences; evaluations use a task's first validation sentence."""
 
 
 def load_commands(file: str | Path | None, split: str) -> dict[str, list[str]]:
-    """Sentences by task: those of `COMMANDS`, or those of `file` for the tasks that it has.
+    """Sentences by task: those of `file` for the tasks that it names, those of `COMMANDS` for the others.
 
     Args:
-        file: YAML, task name to a sentence or a list of sentences, as in CALVIN's annotation files; or None.
+        file: YAML file in the form of CALVIN's annotations, task name to a sentence or a list of sentences; or None.
         split: `"training"` or `"validation"`.
 
     Raises:
-        DeskError: The file is missing, is not of that form, or names a task that does not exist.
+        DeskError: The file is missing, has another form, or names an unknown task.
     """
     commands = dict(COMMANDS[split])
     if file is None:

@@ -8,34 +8,35 @@ from ..calvin import BULB, COLORS, DRAWER, LED, SLIDE, SWITCH, TASKS, Task, bloc
 from .desk import Desk
 from .errors import DeskError
 from .oracle import SURFACES, TABLE, is_stacked
-from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, BUTTON_Y, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
-
-TABLE_Z = 0.46
-"""Height of a block's centre on the table and on the cabinet's floor (m)."""
-DRAWER_Z = 0.362
-"""Height of a block's centre in the drawer (m)."""
-
-DOOR_WIDTH = 0.28
-"""The cabinet's sliding door (m); its left edge is at the scene's `slide_x` minus the joint."""
-REACH = 0.41
-"""|x| up to which blocks can be pushed and still lie on the table, which ends at 0.44 (m)."""
+from .scenes import (
+    BLOCK_LENGTHS,
+    BLOCK_SIDE,
+    BUTTON_Y,
+    DRAWER_TRAVEL,
+    DRAWER_Z,
+    REACH,
+    SWITCH_TRAVEL,
+    TABLE_Z,
+    Scene,
+    beside_door,
+)
 
 _CLEARANCE = 0.10  # between block centres (m): no two blocks touch, and a hand fits between most of them
 _TRIES = 200
-_REACHED = 0.02  # a start pose counts when IK brings the TCP this near (m)
+_NEAR = 0.02  # how near IK must bring the TCP to a start pose, and how far settling may move a block (m)
 
 
 def sample_start(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A random state of `desk` in which `task` is feasible, and not yet fulfilled.
 
-    Joints and lights that the task does not care about are random, blocks lie in the scene's areas with yaw in
-    pi/2 +- pi/8 (both as in CALVIN's benchmark), the TCP is anywhere in a box above the table. For `place_*` and
-    `stack_block` a block is in the hand, for `unstack_block` one stands on another.
+    Joints and lights that do not matter to the task are random. Blocks lie in the scene's areas with yaw in
+    pi/2 +- pi/8 (both as in CALVIN's benchmark). The TCP is anywhere in a box above the table. For `place_*` and
+    `stack_block` a block is in the hand, for `unstack_block` one block stands on another.
 
     Args:
-        desk: Used to solve inverse kinematics and to settle the blocks; left in the returned state.
+        desk: Used to solve inverse kinematics and to let the blocks settle; left in the returned state.
         task: One of `TASKS`.
-        rng: Decides everything.
+        rng: The only source of randomness.
 
     Returns:
         `robot_obs` (15,) and `scene_obs` (24,), arguments for `Desk.reset`.
@@ -57,9 +58,9 @@ def sample_start(desk: Desk, task: str, rng: np.random.Generator) -> tuple[np.nd
 
 
 def _try(desk: Desk, task: Task, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
-    state = _furniture(desk.scene, task, rng)
+    furniture = _furniture(desk.scene, task, rng)
     held = _held_color(task, rng)
-    poses = _blocks(desk.scene, task, held, state, rng)
+    poses = _blocks(desk.scene, task, held, furniture, rng)
     if poses is None:
         return None
     robot = _arm(desk, held is not None, rng)
@@ -68,43 +69,37 @@ def _try(desk: Desk, task: Task, rng: np.random.Generator) -> tuple[np.ndarray, 
     if held is not None:
         # between the fingers, long side across them
         poses[held] = np.array([*robot[:3], 0.0, 0.0, robot[5]])
-    scene = np.concatenate([state, *(poses[color] for color in COLORS)])
-    obs = desk.reset(robot, scene)
+    chosen = np.concatenate([furniture, *(poses[color] for color in COLORS)])
+    obs = desk.reset(robot, chosen)
     for _ in range(4):
         obs = desk.step([*robot[:6], robot[14]], control_mode="abs")
     robot_obs, scene_obs = obs["robot_obs"].copy(), obs["scene_obs"].copy()
-    if not _is_feasible(desk, task, held, scene, scene_obs):
+    if not _is_feasible(desk, task, held, chosen, scene_obs):
         return None
     desk.reset(robot_obs, scene_obs)
     return robot_obs, scene_obs
 
 
-def _is_feasible(desk: Desk, task: Task, held: str | None, wanted: np.ndarray, got: np.ndarray) -> bool:
-    """Whether the state after settling still is what was asked for."""
+def _is_feasible(desk: Desk, task: Task, held: str | None, chosen: np.ndarray, settled: np.ndarray) -> bool:
+    """Whether `task` is feasible after settling: `scene_obs` (24,) as it was `chosen`, and as it has `settled`."""
     snapshot = desk.snapshot()
     if snapshot.touched_by_robot != (frozenset() if held is None else {held}):
         return False
     if held is not None and snapshot.blocks[held].bodies != {"robot"}:
         return False
-    if any(np.linalg.norm((got[block_pose(i)] - wanted[block_pose(i)])[:3]) > 0.02 for i in range(len(COLORS))):
+    if any(np.linalg.norm((settled - chosen)[block_pose(i)][:3]) > _NEAR for i in range(len(COLORS))):
         return False
     if task.color is not None:
-        x = got[block_pose(COLORS.index(task.color))][0]
+        x = settled[block_pose(COLORS.index(task.color))][0]
         if task.kind == "push_block" and abs(x + (0.11 if task.side == "right" else -0.11)) > REACH:
             return False
-        if task.place == "slider" and not beside_door(desk.scene, got[SLIDE], x):
+        if task.place == "slider" and not beside_door(desk.scene, settled[SLIDE], x):
             return False
         return snapshot.blocks[task.color].contacts == {SURFACES.get(task.place, TABLE)}
     if task.kind == "unstack_block":
         return any(is_stacked(block) for block in snapshot.blocks.values())
-    settled = [SLIDE, DRAWER, SWITCH, BULB, LED]  # a button may still be on its way
-    return bool(np.allclose(got[settled], wanted[settled], atol=5e-3))
-
-
-def beside_door(scene: Scene, slide: float, x: float) -> bool:
-    """Whether a finger fits between a block at `x` in the cabinet and the door's edge: 0.045 m from its middle."""
-    door = scene.slide_x - slide
-    return bool(x < door - 0.045 or x > door + DOOR_WIDTH + 0.045)
+    compared = [SLIDE, DRAWER, SWITCH, BULB, LED]  # not the button, which may still be moving
+    return bool(np.allclose(settled[compared], chosen[compared], atol=5e-3))
 
 
 def _held_color(task: Task, rng: np.random.Generator) -> str | None:
@@ -114,7 +109,7 @@ def _held_color(task: Task, rng: np.random.Generator) -> str | None:
 
 
 def _furniture(scene: Scene, task: Task, rng: np.random.Generator) -> np.ndarray:
-    """Slide, drawer, button, switch, bulb, LED: (6,); joints are at an end three times out of four."""
+    """The first part of `scene_obs`, (6,); slide and drawer are at an end of their travel three times out of four."""
     bulb, led = (bool(rng.integers(2)) for _ in range(2))
     bulb = {"turn_on_lightbulb": False, "turn_off_lightbulb": True}.get(task.name, bulb)
     led = {"turn_on_led": False, "turn_off_led": True}.get(task.name, led)
@@ -129,17 +124,17 @@ def _furniture(scene: Scene, task: Task, rng: np.random.Generator) -> np.ndarray
 
 
 def _joint(rng: np.random.Generator, travel: float, needed: float, end: int | None) -> float:
-    """A joint value; `end` 0 or 1 leaves at least `needed` (m) to the other end."""
+    """A joint value (m) at or near `end` (0 or 1, None: either), at least `needed` m from the other end."""
     end = int(rng.integers(2)) if end is None else end
     slack = (travel - needed) * rng.uniform() if rng.uniform() < 0.25 else 0.0
     return slack if end == 0 else travel - slack
 
 
 def _blocks(
-    scene: Scene, task: Task, held: str | None, state: np.ndarray, rng: np.random.Generator
+    scene: Scene, task: Task, held: str | None, furniture: np.ndarray, rng: np.random.Generator
 ) -> dict[str, np.ndarray] | None:
-    """Block poses (6,) by colour, or None when they came too near to each other."""
-    open_side = "slider_right" if state[0] > scene.slide_travel / 2 else "slider_left"
+    """Colour to block pose (6,), or None if two blocks, or a block and the button, are too close together."""
+    open_side = "slider_right" if furniture[SLIDE] > scene.slide_travel / 2 else "slider_left"
     places = {c: str(rng.choice(list(scene.areas))) for c in COLORS}
     if task.color is not None:
         places[task.color] = {"slider": open_side, "drawer": "drawer"}.get(str(task.place), "table")
@@ -159,14 +154,14 @@ def _blocks(
     if any(np.linalg.norm(a[:2] - b[:2]) < _CLEARANCE for a, b in itertools.combinations(others, 2)):
         return None
     longest = max(BLOCK_LENGTHS.values()) / 2
-    if any(
-        abs(pose[0] - scene.button_x) < longest + 0.04 and abs(pose[1] - BUTTON_Y) < longest + 0.04 for pose in others
-    ):
-        return None  # half on the button's rim
+    button = scene.button_x, BUTTON_Y
+    if any((np.abs(pose[:2] - button) < longest + 0.04).all() for pose in others):
+        return None  # partly on the button's rim
     return poses
 
 
 def _on(scene: Scene, place: str, rng: np.random.Generator) -> np.ndarray:
+    """A block pose (6,) in the drawer, on the table behind the drawer's edge, or in one of the scene's areas."""
     yaw = np.pi / 2 + rng.uniform(-np.pi / 8, np.pi / 8)
     if place == "drawer":
         xyz = [scene.drawer_x + rng.uniform(-0.11, 0.11), rng.uniform(-0.32, -0.25), DRAWER_Z]
@@ -190,11 +185,11 @@ def _arm(desk: Desk, holding: bool, rng: np.random.Generator) -> np.ndarray | No
     width = 0.039 if holding else 0.08 if opened else 0.0
     robot = np.array([*position, *euler, width, *joints, 1.0 if opened else -1.0])
     reached = desk.reset(robot, _away())["robot_obs"]
-    if np.linalg.norm(reached[:3] - position) > _REACHED:
+    if np.linalg.norm(reached[:3] - position) > _NEAR:
         return None
     return np.array([*reached[:6], width, *joints, robot[14]])
 
 
 def _away() -> np.ndarray:
-    """A scene whose blocks are out of the arm's reach."""
+    """A `scene_obs` (24,) whose blocks are out of the arm's reach."""
     return np.array([0.0] * 6 + [v for i in range(3) for v in (3.0 + i, 3.0, 0.02, 0.0, 0.0, 0.0)])

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pybullet as p
 
-from ..cameras import Camera
+from ..cameras import Intrinsics
 from ..errors import DeskError
 
 _PLUGIN = "_eglRendererPlugin"
 Colors = dict[tuple[int, int], tuple[float, ...]]
+"""(body, link) to rgba, 0 to 1."""
 
 
 class BulletRenderer:
@@ -40,22 +41,22 @@ class BulletRenderer:
         self._shown: Colors = {}
         if plugin is not None:  # the plugin's first two pictures have no shadow
             for _ in range(2):
-                self.draw(Camera(16, 60.0, 0.1, 10.0), np.eye(4), 16, {})
+                self.draw(Intrinsics(16, 60.0, 0.1, 10.0), np.eye(4), 16, {})
 
     def draw(
-        self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False
+        self, intrinsics: Intrinsics, view: np.ndarray, size: int, colors: Colors, fixed: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """As `fast.FastRenderer.draw`."""
         for (body, link), color in colors.items():
             if self._shown.get((body, link)) != color:
                 p.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
                 self._shown[body, link] = color
-        near, far = camera.near, camera.far
+        near, far = intrinsics.near, intrinsics.far
         image: Any = p.getCameraImage(
             size,
             size,
             view.T.ravel().tolist(),
-            p.computeProjectionMatrixFOV(camera.fov, 1.0, near, far),
+            p.computeProjectionMatrixFOV(intrinsics.fov, 1.0, near, far),
             renderer=self._renderer,
             physicsClientId=self._client,
         )
@@ -66,14 +67,17 @@ class BulletRenderer:
 
 @cache
 def _egl_works(plugin: str) -> bool:
-    """Tried in another process: without a driver the plugin ends the one that loads it."""
+    """Whether the plugin can be loaded; tried in another process, because without a driver it ends the process."""
     code = "import pybullet as p, sys; p.connect(p.DIRECT); sys.exit(p.loadPlugin(sys.argv[1], sys.argv[2]) < 0)"
     command = [sys.executable, "-c", code, plugin, _PLUGIN]
     return subprocess.run(command, capture_output=True, timeout=60).returncode == 0
 
 
 def load_egl(client: int) -> int:
-    """Loads the EGL plugin, which must happen before anything is loaded into the client; returns its id.
+    """Loads the EGL plugin into a Bullet client, before any body: it draws only what is loaded later.
+
+    Returns:
+        The plugin's id.
 
     Raises:
         DeskError: The plugin, EGL or a driver for it is missing.

@@ -1,7 +1,7 @@
 """What our two software renderers share: geometry in flat arrays, and finding the nearest face at each pixel.
 
-Both draw the triangles that PyBullet's renderers draw, but look at each pixel's colour once, skip links that are out
-of the picture, and draw what never moves once per standing camera.
+Both draw the triangles that PyBullet's renderers draw, but compute each pixel's colour once, skip links that are out
+of the picture, and draw what never moves once per fixed camera.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,26 +9,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..cameras import Camera
+from ..cameras import Intrinsics
 from . import raster
 from .bullet import Colors
 from .stage import Group, Stage
 
 BACKDROPS = 3
-"""Standing cameras and sizes whose backdrops are kept, some MB each."""
+"""How many backdrops, a few MB each, are kept: one per fixed camera and picture size."""
 
 
 class FastRenderer:
-    """Draws a stage; its subclasses say how light falls.
+    """Draws a stage; subclasses define colours and light.
 
     Args:
-        stage: What there is to see, and where.
+        stage: What there is to draw, and where.
     """
 
-    smallest = np.float32(0)
-    """Faces of fewer doubled square pixels are not drawn."""
+    min_area = np.float32(0)
+    """Faces whose doubled area in the picture is smaller (square pixels) are not drawn."""
     sample = 0.0
-    """Where in a pixel it is sampled: 0 its lower left corner, 0.5 its middle."""
+    """Where pixels are sampled: 0 at the lower left corner, 0.5 in the middle."""
 
     def __init__(self, stage: Stage):
         self._stage = stage
@@ -49,144 +49,149 @@ class FastRenderer:
         self._parts = [_Part(self._vertices[:, v], v, f) for v, f in _ranges(stage.groups)]
         self._still = [i for i, group in enumerate(stage.groups) if group.still]
         self._moving = [i for i, group in enumerate(stage.groups) if not group.still]
-        # blocks tremble where they lie; joints stand still to the last bit
-        self._slow = [i for i in self._moving if stage.groups[i].jointed]
+        # resting blocks tremble; resting joints stand still to the last bit
+        self._jointed = [i for i in self._moving if stage.groups[i].jointed]
         self._backdrops: dict[tuple[int, bytes], tuple[_Layer, _Layer]] = {}
 
     def draw(
-        self, camera: Camera, view: np.ndarray, size: int, colors: Colors, keep: bool = False
+        self, intrinsics: Intrinsics, view: np.ndarray, size: int, colors: Colors, fixed: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A picture of the present state and its depth.
+        """A picture of the present state and its inverse depth.
 
         Args:
-            camera: Field of view and clip planes.
+            intrinsics: Field of view and clip planes.
             view: (4, 4) world to eye.
             size: Pixels per side.
-            colors: Rgba of (body, link) that were repainted.
-            keep: The camera stands still: remember what never moves.
+            colors: (body, link) to rgba where it is not the body's own.
+            fixed: The camera never moves, so what never moves is drawn only once.
 
         Returns:
-            (size, size, 3) uint8, and (size, size) float32 of 1 / distance along the view axis (0 where there is
-            nothing).
+            Picture (size, size, 3) uint8, and inverse depth (size, size) float32: 1 / distance along the view axis
+            (1/m), 0 where there is nothing.
         """
-        lens = self._lens(camera, size) @ view
+        projection = self._intrinsic_matrix(intrinsics, size) @ view
         poses = self._stage.poses()
-        if keep:
-            layer, rest = self._settled(camera, lens, size, poses, colors)
-            canvas, closeness = layer.canvas.copy(), layer.closeness.copy()
+        if fixed:
+            layer, rest = self._backdrop(intrinsics, projection, size, poses, colors)
+            canvas, depth_buffer = layer.canvas.copy(), layer.depth_buffer.copy()
         else:
-            canvas, closeness = self._blank(size), np.zeros((size, size), np.float32)
+            canvas, depth_buffer = self._blank(size), np.zeros((size, size), np.float32)
             rest = list(range(len(self._parts)))
-        self._paint(rest, lens, camera, poses, colors, canvas, closeness)
-        return self._finish(canvas, closeness, poses), self._inverse(closeness, camera)[::-1]
+        self._paint(rest, projection, intrinsics, poses, colors, canvas, depth_buffer)
+        return self._finish(canvas, depth_buffer, poses), self._inverse_depth(depth_buffer, intrinsics)[::-1]
 
-    def _settled(
-        self, camera: Camera, lens: np.ndarray, size: int, poses: np.ndarray, colors: Colors
+    def _backdrop(
+        self, intrinsics: Intrinsics, projection: np.ndarray, size: int, poses: np.ndarray, colors: Colors
     ) -> tuple["_Layer", list[int]]:
-        """A painting of what has not moved since the last picture of this camera, and the groups it lacks."""
-        key = size, lens.tobytes()
+        """What has not moved since this camera's last picture, already drawn, and the groups still to be drawn."""
+        key = size, projection.tobytes()
         if key not in self._backdrops:
-            if len(self._backdrops) >= BACKDROPS:  # a picture of another size than usual: forget the oldest
+            if len(self._backdrops) >= BACKDROPS:  # forget the oldest
                 del self._backdrops[next(iter(self._backdrops))]
             bottom = _Layer(self._blank(size), np.zeros((size, size), np.float32), poses.copy(), colors, [])
-            self._paint(self._still, lens, camera, poses, {}, bottom.canvas, bottom.closeness)
+            self._paint(self._still, projection, intrinsics, poses, {}, bottom.canvas, bottom.depth_buffer)
             self._backdrops[key] = bottom, bottom
         bottom, layer = self._backdrops[key]
-        same = (poses == layer.poses).all((1, 2))
-        groups = [i for i in self._slow if same[i]] if colors == layer.colors else []
+        unmoved = (poses == layer.poses).all((1, 2))
+        groups = [i for i in self._jointed if unmoved[i]] if colors == layer.colors else []
         if groups != layer.groups:
-            layer = _Layer(bottom.canvas.copy(), bottom.closeness.copy(), poses.copy(), colors, groups)
-            self._paint(groups, lens, camera, poses, colors, layer.canvas, layer.closeness)
-        else:  # the groups painted have not moved: only the others' poses are new
+            layer = _Layer(bottom.canvas.copy(), bottom.depth_buffer.copy(), poses.copy(), colors, groups)
+            self._paint(groups, projection, intrinsics, poses, colors, layer.canvas, layer.depth_buffer)
+        else:  # the layer's own groups have not moved: only the other groups' poses are new
             layer.poses[:] = poses
             layer.colors = colors
         self._backdrops[key] = bottom, layer
         return layer, [i for i in self._moving if i not in groups]
 
-    def _rule(self, camera: Camera, group: int) -> tuple[float, float, float]:
-        """What `raster.nearest` calls close; 1 / w by default."""
+    def _encoding(self, intrinsics: Intrinsics, group: int) -> tuple[float, float, float]:
+        """What the depth buffer holds (`raster.nearest`); inverse depth by default."""
         return 0.0, 0.0, 0.0
 
-    def _inverse(self, closeness: np.ndarray, camera: Camera) -> np.ndarray:
-        """1 / distance from closeness."""
-        return closeness
+    def _inverse_depth(self, depth_buffer: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
+        """Inverse depth (1/m) from the depth buffer."""
+        return depth_buffer
 
     def _blank(self, size: int) -> np.ndarray:
-        """An empty canvas: whatever `_shade` fills."""
+        """An empty canvas for `_shade`."""
         raise NotImplementedError
 
     def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
-        """Fills the canvas where `ids` names a face."""
+        """Fills the canvas where `ids` (size, size) holds the number of a face."""
         raise NotImplementedError
 
-    def _finish(self, canvas: np.ndarray, closeness: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    def _finish(self, canvas: np.ndarray, depth_buffer: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """The picture, (size, size, 3) uint8."""
         raise NotImplementedError
 
-    def _lens(self, camera: Camera, size: int) -> np.ndarray:
+    def _intrinsic_matrix(self, intrinsics: Intrinsics, size: int) -> np.ndarray:
         """(3, 4) eye coordinates to homogeneous pixels (column * w, row * w, w)."""
-        focal = size / 2 / np.tan(np.radians(camera.fov) / 2)
+        focal = size / 2 / np.tan(np.radians(intrinsics.fov) / 2)
         middle = size / 2 - self.sample
         return np.array([[focal, 0, -middle, 0], [0, focal, -middle, 0], [0, 0, -1, 0]])
 
     def _paint(
         self,
-        drawn: Sequence[int],
-        lens: np.ndarray,
-        camera: Camera,
+        groups: Sequence[int],
+        projection: np.ndarray,
+        intrinsics: Intrinsics,
         poses: np.ndarray,
         colors: Colors,
         canvas: np.ndarray,
-        closeness: np.ndarray,
+        depth_buffer: np.ndarray,
     ) -> None:
-        size = len(closeness)
-        limits = np.float32(camera.near), np.float32(camera.far)
+        """Draws groups onto a canvas and its depth buffer."""
+        size = len(depth_buffer)
+        limits = np.float32(intrinsics.near), np.float32(intrinsics.far)
         ids = np.full((size, size), raster.NOTHING, np.int32)
-        matrices = (lens @ poses).astype(np.float32)
-        for index in drawn:
-            part, matrix = self._parts[index], matrices[index]
+        matrices = (projection @ poses).astype(np.float32)
+        for group in groups:
+            part, matrix = self._parts[group], matrices[group]
             if raster.outside(matrix, part.center, part.radius, size):
                 continue
             behind = raster.project(self._vertices[:, part.vertices], matrix, self._screen[part.vertices])
-            first, last = part.faces.start, part.faces.stop
-            raster.nearest(
-                self._faces,
-                first,
-                last,
-                self._screen,
-                behind,
-                limits,
-                self.smallest,
-                self._rule(camera, index),
-                closeness,
-                ids,
-            )
-        tints = self._own_colors
+            encoding = self._encoding(intrinsics, group)
+            self._enter(part, behind, limits, encoding, depth_buffer, ids)
+        rgba = self._own_colors
         if colors:
-            tints = tints.copy()
+            rgba = rgba.copy()
             for index, key in enumerate(self._keys):
                 if key in colors:
-                    tints[index] = colors[key]
-        self._shade(ids, poses, tints, canvas)
+                    rgba[index] = colors[key]
+        self._shade(ids, poses, rgba, canvas)
+
+    def _enter(
+        self,
+        part: "_Part",
+        behind: bool,
+        limits: tuple[np.float32, np.float32],
+        encoding: tuple[float, float, float],
+        depth_buffer: np.ndarray,
+        ids: np.ndarray,
+    ) -> None:
+        """Enters a part's faces, whose vertices are already projected, into the buffers (`raster.nearest`)."""
+        faces, screen, (first, last) = self._faces, self._screen, (part.faces.start, part.faces.stop)
+        raster.nearest(faces, first, last, screen, behind, limits, self.min_area, encoding, depth_buffer, ids)
 
 
 @dataclass
 class _Layer:
-    """Part of a picture: `groups` are painted on it, besides what never moves.
+    """Part of a picture.
 
     Attributes:
-        poses, colors: As they were when the camera last took a picture.
+        canvas, depth_buffer: Drawn so far.
+        poses, colors: Those of the camera's last picture.
+        groups: Groups that are drawn, besides those that never move.
     """
 
     canvas: np.ndarray
-    closeness: np.ndarray
+    depth_buffer: np.ndarray
     poses: np.ndarray
     colors: Colors
     groups: list[int]
 
 
 class _Part:
-    """Where a group's vertices and faces lie in the arrays, and the sphere around them."""
+    """Where the arrays hold a group's vertices and faces, and the sphere around them."""
 
     def __init__(self, points: np.ndarray, vertices: slice, faces: slice):
         self.vertices, self.faces = vertices, faces
@@ -205,16 +210,23 @@ def _ranges(groups: Sequence[Group]) -> Iterator[tuple[slice, slice]]:
         yield slice(first_vertex, vertex), slice(first_face, face)
 
 
-def pack(textures: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """All texels of pictures in one (T, 3) array, and (start, width, height) of each; equal pictures share them."""
+def pack(images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Images in one array; an image that occurs twice is held once.
+
+    Args:
+        images: (height, width, 3) uint8 each.
+
+    Returns:
+        (images, 3) int64: first texel, width and height of each image; and all texels, (T, 3) uint8.
+    """
     starts: dict[int, int] = {}
-    rows: list[np.ndarray] = [np.zeros((1, 3), np.uint8)]
+    texels: list[np.ndarray] = [np.zeros((1, 3), np.uint8)]
     count = 1
-    places = np.zeros((len(textures), 3), np.int64)
-    for index, texture in enumerate(textures):
-        if id(texture) not in starts:
-            starts[id(texture)] = count
-            rows.append(texture.reshape(-1, 3))
-            count += len(rows[-1])
-        places[index] = starts[id(texture)], texture.shape[1], texture.shape[0]
-    return places, np.concatenate(rows)
+    table = np.zeros((len(images), 3), np.int64)
+    for index, image in enumerate(images):
+        if id(image) not in starts:
+            starts[id(image)] = count
+            texels.append(image.reshape(-1, 3))
+            count += len(texels[-1])
+        table[index] = starts[id(image)], image.shape[1], image.shape[0]
+    return table, np.concatenate(texels)

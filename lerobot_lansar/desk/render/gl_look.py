@@ -1,25 +1,25 @@
-"""`renderer="fast_gl"`: the pictures that Bullet's OpenGL renderer draws, CALVIN's public data among them."""
+"""`renderer="fast_gl"`: the pictures that Bullet's OpenGL renderer draws, among them those of CALVIN's public data."""
 
 import numpy as np
 from PIL import Image
 
-from ..cameras import Camera
-from . import raster
+from ..cameras import Intrinsics
+from . import raster, shading
 from .fast import FastRenderer, pack
 from .stage import Stage
 
 LIGHT = np.array([-5.0, -40.0, 200.0])
-"""Where the EGL plugin's light is, m."""
+"""Position of the EGL plugin's light, m."""
 HIGHLIGHT_EYE = 20 * np.array([np.sin(np.radians(20)), -np.cos(np.radians(20)), 0.0])
-"""The plugin computes highlights for its window's own camera, not for the one that takes the picture."""
+"""Position of the camera for which the plugin computes highlights, m: its window's, not the one that is drawn for."""
 BACKGROUND = (179, 179, 204)
 
 TEXELS_PER_METRE = 4096 / 20
-"""Of the plugin's shadow map, which spans 20 m around the origin."""
+"""Resolution of the plugin's shadow map, which spans 20 m around the origin."""
 STEP = 299 / 65535
-"""Height (m) of one step of the shadow map's 16 bits: it spans distances of 1 to 300 m."""
+"""Height of one step of the shadow map's 16 bits (m): it spans distances of 1 to 300 m."""
 _REGION = (-1.45, 0.85, -1.55, 0.7, 0.0, 1.3)
-"""Box (m) around everything that can cast a shadow: x, y and z, lowest and highest."""
+"""Minimum and maximum x, y and z of everything that can cast a shadow (m)."""
 
 
 class OpenGLLook(FastRenderer):
@@ -29,45 +29,44 @@ class OpenGLLook(FastRenderer):
 
     def __init__(self, stage: Stage):
         super().__init__(stage)
-        textures = [visual.mesh.texture for group in stage.groups for visual in group.visuals]
-        chains = {id(texture): mipmaps(texture) for texture in textures if texture is not None}
-        firsts: dict[int, int] = {}
-        flat: list[np.ndarray] = []
-        for key, chain in chains.items():
-            firsts[key] = len(flat)
-            flat += chain
-        self._levels, self._texels = pack(flat)
-        self._places = np.array(
-            [(firsts[id(t)], len(chains[id(t)])) if t is not None else (0, 0) for t in textures], np.int64
-        )
+        images = [visual.mesh.texture for group in stage.groups for visual in group.visuals]
+        levels: list[np.ndarray] = []
+        ranges: dict[int, tuple[int, int]] = {}  # image to first level and number of levels
+        for image in images:
+            if image is not None and id(image) not in ranges:
+                chain = mipmaps(image)
+                ranges[id(image)] = len(levels), len(chain)
+                levels += chain
+        self._levels, self._texels = pack(levels)
+        self._textures = np.array([ranges.get(id(image), (0, 0)) for image in images], np.int64)
         self._shadow, extent = shadow_matrix()
         self._casters = np.zeros((extent, extent), np.float32)
         poses = self._stage.poses()
         self._cast(self._still, poses, self._casters)
-        self._heights, self._shadow_of = self._casters, np.zeros(0)
+        self._heights, self._shadow_poses = self._casters, np.zeros(0)
 
     def _blank(self, size: int) -> np.ndarray:
         return np.zeros((size, size, 8), np.float32)
 
-    def _rule(self, camera: Camera, group: int) -> tuple[float, float, float]:
-        """The plugin asks for a depth buffer of 8 bits and gets one of 16; what was loaded first wins."""
-        offset, scale = _depth_steps(camera)
+    def _encoding(self, intrinsics: Intrinsics, group: int) -> tuple[float, float, float]:
+        """The plugin asks for a depth buffer of 8 bits and gets 16; at equal depth, what was loaded first wins."""
+        offset, scale = _depth_steps(intrinsics)
         return offset, scale, float(raster.RANKS - 1 - group % raster.RANKS)
 
-    def _inverse(self, closeness: np.ndarray, camera: Camera) -> np.ndarray:
-        offset, scale = _depth_steps(camera)
-        steps = np.floor(closeness / raster.RANKS)
-        return np.where(closeness > 0, (steps - offset) / scale, 0).astype(np.float32)
+    def _inverse_depth(self, depth_buffer: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
+        offset, scale = _depth_steps(intrinsics)
+        steps = np.floor(depth_buffer / raster.RANKS)
+        return np.where(depth_buffer > 0, (steps - offset) / scale, 0).astype(np.float32)
 
     def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
-        raster.light_gl(
+        shading.light_gl(
             ids,
             self._faces,
             self._screen,
             self._owner,
             self._normals,
             self._uvs,
-            self._places,
+            self._textures,
             self._levels,
             self._texels,
             colors,
@@ -80,49 +79,37 @@ class OpenGLLook(FastRenderer):
             canvas,
         )
 
-    def _finish(self, canvas: np.ndarray, closeness: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        if not np.array_equal(poses, self._shadow_of):  # both cameras see the same shadow
+    def _finish(self, canvas: np.ndarray, depth_buffer: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        if not np.array_equal(poses, self._shadow_poses):  # both cameras see the same shadow
             self._heights = self._casters.copy()
             self._cast(self._moving, poses, self._heights)
-            self._shadow_of = poses.copy()
-        picture = np.empty((*closeness.shape, 3), np.uint8)
+            self._shadow_poses = poses.copy()
+        picture = np.empty((*depth_buffer.shape, 3), np.uint8)
         picture[:] = BACKGROUND
-        raster.compose_gl(canvas, closeness, self._heights, STEP, picture)
+        shading.compose_gl(canvas, depth_buffer, self._heights, STEP, picture)
         return picture
 
     def _cast(self, groups: list[int], poses: np.ndarray, heights: np.ndarray) -> None:
-        """Enters the back faces of groups into the shadow map."""
+        """Enters the back faces of groups into the shadow map `heights`."""
         ids = np.empty(heights.shape, np.int32)
         limits = np.float32(1e-6), np.float32(np.inf)
         matrices = (self._shadow @ poses).astype(np.float32)
-        for index in groups:
-            part = self._parts[index]
-            raster.project_flat(self._vertices[:, part.vertices], matrices[index], self._screen[part.vertices])
-            first, last = part.faces.start, part.faces.stop
-            raster.nearest(
-                self._faces,
-                first,
-                last,
-                self._screen,
-                False,
-                limits,
-                self.smallest,
-                (0.0, 0.0, 0.0),
-                heights,
-                ids,
-            )
+        for group in groups:
+            part = self._parts[group]
+            raster.project_flat(self._vertices[:, part.vertices], matrices[group], self._screen[part.vertices])
+            self._enter(part, False, limits, (0.0, 0.0, 0.0), heights, ids)
 
 
-def _depth_steps(camera: Camera) -> tuple[float, float]:
-    """Steps of a 16-bit depth buffer in front of the far plane at w m: offset + scale / w."""
-    near, far = camera.near, camera.far
+def _depth_steps(intrinsics: Intrinsics) -> tuple[float, float]:
+    """(offset, scale): what is w m away is offset + scale / w steps of 16 bits in front of the far plane."""
+    near, far = intrinsics.near, intrinsics.far
     return -65535 * near / (far - near), 65535 * far * near / (far - near)
 
 
 def shadow_matrix() -> tuple[np.ndarray, int]:
-    """World to the shadow map, (3, 4): column, row and height towards the light (m); and how many texels a side has.
+    """World to the shadow map, (3, 4): column, row and height towards the light (m); and its side in texels.
 
-    The columns run against the plugin's, so that the back faces, which cast the shadow, turn to the front.
+    Columns run in the opposite direction of the plugin's. This turns back faces, which cast the shadow, to the front.
     """
     forward = -LIGHT / np.linalg.norm(LIGHT)
     up = np.cross(np.array([1.0, 0.0, 0.0]), -forward)
@@ -139,7 +126,7 @@ def shadow_matrix() -> tuple[np.ndarray, int]:
 
 
 def mipmaps(texture: np.ndarray) -> list[np.ndarray]:
-    """A texture and its halvings down to one texel, each the mean of what it covers."""
+    """A texture and its halvings down to one texel; every texel is the mean of those that it covers."""
     levels = [texture]
     while max(levels[-1].shape[:2]) > 1:
         height, width = (max(1, n // 2) for n in levels[-1].shape[:2])

@@ -1,7 +1,7 @@
 """Where the links of a body are, from its joints alone.
 
-Asking Bullet for fresh link poses changes what it answers to CALVIN's own (one simulation step old) question for the
-TCP, so the renderer works them out itself.
+Asking Bullet for up-to-date link poses would change the TCP pose that it reports to `robot_obs`, which must be one
+simulation step old, as in CALVIN. So the renderer computes them itself.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class Links:
         self._axes = np.array([info[13] for info in infos], np.float64).reshape(-1, 3)
         self._parents = np.array([info[16] for info in infos], np.int64)
         inertial = [self._inertial(client, body, link) for link in range(-1, count)]
-        # Bullet states a joint's place in its parent's inertial frame, with the rotation inverted
+        # Bullet gives a joint's frame relative to its parent's inertial frame, with the rotation inverted
         self._joints = np.array(
             [inertial[info[16] + 1] @ transform(info[14], p.invertTransform((0, 0, 0), info[15])[1]) for info in infos]
         ).reshape(-1, 4, 4)
@@ -37,7 +37,7 @@ class Links:
         self.moving = [joint for joint in range(count) if self._kinds[joint]]
 
     def moves(self, link: int) -> bool:
-        """Whether some joint between the base and `link` moves."""
+        """Whether any joint between the base and `link` can move."""
         while link >= 0:
             if self._kinds[link]:
                 return True

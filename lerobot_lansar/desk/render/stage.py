@@ -1,4 +1,4 @@
-"""What there is to draw in a Bullet client, and where it is now."""
+"""What there is to draw in a Bullet client, and its present pose."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -15,8 +15,10 @@ class Group:
     """The visuals of one link, which move together.
 
     Attributes:
-        still: They never move and never change their colour.
-        jointed: The link belongs to a body with joints.
+        body, link: Bullet's ids.
+        visuals: The link's shapes.
+        still: Whether they never move and never change their colour.
+        jointed: Whether the body has joints.
     """
 
     body: int
@@ -27,12 +29,15 @@ class Group:
 
 
 class Stage:
-    """Groups of visuals and their poses.
+    """All visuals of a Bullet client, in groups, and their poses.
 
     Args:
         client: Bullet client.
         visuals: All its visuals, in Bullet's order.
         repainted: (body, link) whose colours change.
+
+    Attributes:
+        groups: One per link that has visuals.
     """
 
     def __init__(self, client: int, visuals: Sequence[Visual], repainted: Collection[tuple[int, int]]):
@@ -59,7 +64,7 @@ class Stage:
         }
 
     def poses(self) -> np.ndarray:
-        """URDF frame of every group's link in world coordinates, (groups, 4, 4); the array is used again."""
+        """URDF frame of every group's link in world coordinates, (groups, 4, 4); the next call overwrites the array."""
         for body, links in self._jointed.items():
             states = p.getJointStates(body, links.moving, physicsClientId=self._client)
             frames = links.poses([state[0] for state in states])

@@ -1,9 +1,9 @@
-"""What the bodies of a Bullet client look like: triangles, colours and textures, read once after loading."""
+"""What the bodies of a Bullet client look like: triangles, colours and textures."""
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ import pybullet as p
 import trimesh
 from scipy.spatial import ConvexHull
 from trimesh.exchange.obj import load_obj
+from trimesh.exchange.stl import HeaderError, load_stl_binary
 
 from ..errors import DeskError
 
-_ROUND_SIDES = 32  # Bullet draws a cylinder as a prism of this many sides, thinned out by _directions
-_MARGIN = 0.001  # m; and thicker by this
+_CYLINDER_SIDES = 32  # Bullet draws a cylinder as a prism, of whose corners it keeps one per direction of _directions
+_MARGIN = 0.001  # and adds this much all around (m)
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,10 @@ def read_visuals(client: int, round_boxes: bool = False) -> list[Visual]:
 
     Args:
         client: Bullet client.
-        round_boxes: Boxes are lit as if they were round, a habit of the EGL plugin.
+        round_boxes: Whether boxes are lit as if they were round, as the EGL plugin does.
 
     Raises:
-        DeskError: A mesh file is of a kind that this reader does not know, or cannot be read.
+        DeskError: A shape is of an unknown kind, or a mesh file cannot be read.
     """
     visuals = []
     for index in range(p.getNumBodies(physicsClientId=client)):
@@ -101,19 +102,19 @@ def _shape(kind: int, size: tuple[float, ...], file: str, round_boxes: bool) -> 
         return _hull(_directions() * size[0]), one
     if kind == p.GEOM_CYLINDER:
         length, radius = size[:2]
-        angles = 2 * np.pi * np.arange(_ROUND_SIDES) / _ROUND_SIDES
+        angles = 2 * np.pi * np.arange(_CYLINDER_SIDES) / _CYLINDER_SIDES
         ring = np.stack([radius * np.sin(angles), radius * np.cos(angles)], 1)
         corners = np.concatenate([np.insert(ring, 2, z, 1) for z in (length / 2, -length / 2)])
         return _hull(corners[(_directions() @ corners.T).argmax(1)] + _MARGIN * _directions()), one
     raise DeskError(f"a visual shape of Bullet's kind {kind} cannot be drawn; choose renderer tiny or egl")
 
 
-@lru_cache(64)  # temporary files come and go under ever new names
+@cache
 def load_mesh(file: str) -> Mesh:
-    """A mesh from an OBJ file (with the texture its material names) or a binary STL file.
+    """A mesh from an OBJ file, with the texture that its material names, or from a binary STL file.
 
     Raises:
-        DeskError: Another kind of file, or one that cannot be read.
+        DeskError: The file is of another kind, or cannot be read.
     """
     path = Path(file)
     if path.suffix.lower() == ".obj":
@@ -124,7 +125,7 @@ def load_mesh(file: str) -> Mesh:
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):
-    """Finds the files that a mesh names relative to its folder, above it too."""
+    """Reads the files that a mesh names relative to its folder, even those outside that folder."""
 
     def get(self, name: str) -> bytes:
         return (Path(self.parent) / name.strip()).read_bytes()
@@ -137,7 +138,7 @@ def _load_obj(path: Path) -> Mesh:
             loaded = load_obj(file, resolver=_Neighbours(str(path)), group_material=False)
     except (OSError, ValueError, IndexError) as error:
         raise DeskError(f"{path} cannot be read as OBJ: {error}") from error
-    # In the file's order (they come last first): of two faces in one place it decides which one is seen.
+    # reversed into the file's order, which decides which one of two coinciding faces is seen
     pieces = list(loaded["geometry"].values())[::-1] if "geometry" in loaded else [loaded]
     pieces = [piece for piece in pieces if len(piece.get("faces", ()))]
     if not pieces:
@@ -148,7 +149,7 @@ def _load_obj(path: Path) -> Mesh:
         if "vertex_normals" in piece:
             normals.append(_unit(np.asarray(piece["vertex_normals"], np.float32)[corners]))
         else:
-            normals.append(np.repeat(_face_normals(vertices, corners)[:, None], 3, axis=1))
+            normals.append(_flat(_face_normals(vertices, corners)))
         given = getattr(piece.get("visual"), "uv", None)
         uvs.append(given[corners] if given is not None else np.full((*corners.shape, 2), 0.5))
         points.append(vertices)
@@ -165,7 +166,7 @@ def _load_obj(path: Path) -> Mesh:
 
 
 def _texture(pieces: Sequence[dict[str, Any]]) -> np.ndarray | None:
-    """The picture of the first material that has one: Bullet covers the whole mesh with it."""
+    """The image of the first material that has one; Bullet applies it to the whole mesh."""
     for piece in pieces:
         image = getattr(getattr(piece.get("visual"), "material", None), "image", None)
         if image is not None:
@@ -173,79 +174,70 @@ def _texture(pieces: Sequence[dict[str, Any]]) -> np.ndarray | None:
     return None
 
 
-@lru_cache(32)
+@cache
 def _shared(width: int, height: int, pixels: bytes) -> np.ndarray:
-    """Equal pictures become one array."""
+    """One array for all equal images."""
     return np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
 
 
 def _load_stl(path: Path) -> Mesh:
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DeskError(f"{path} cannot be read: {error}") from error
-    count = int.from_bytes(data[80:84], "little")
-    if len(data) != 84 + 50 * count:
-        raise DeskError(f"{path} is no binary STL file: {len(data)} bytes, expected {84 + 50 * count}")
-    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")])
-    triangles = np.frombuffer(data, record, count, 84)
-    corners = triangles["corners"].reshape(-1, 3)
-    vertices, faces = _merged(corners, np.arange(len(corners)).reshape(-1, 3))
-    normals = np.repeat(triangles["normal"][:, None], 3, axis=1)
-    uvs = np.full((count, 3, 2), 0.5, np.float32)
-    return Mesh(vertices, faces, _unit(normals), uvs)
+        with path.open("rb") as file:
+            loaded = load_stl_binary(file)
+    except (OSError, HeaderError) as error:
+        raise DeskError(f"{path} cannot be read as binary STL: {error}") from error
+    if "faces" not in loaded:
+        raise DeskError(f"{path} holds no faces")
+    vertices, faces = _merged(loaded["vertices"], loaded["faces"])
+    return Mesh(vertices, faces, _flat(_unit(loaded["face_normals"])), _no_uvs(faces))
 
 
 @cache
 def _box() -> Mesh:
     """A cube of side 1 around the origin."""
-    vertices, normals = [], []
-    for axis in range(3):
-        for sign in (1, -1):
-            a, b = (axis + 1) % 3, (axis + 2) % 3
-            for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-                corner = np.zeros(3)
-                corner[[axis, a, b]] = sign, u * sign, v
-                vertices.append(corner / 2)
-                normals.append(sign * np.eye(3)[axis])
-    faces = np.array([[4 * k + i for i in t] for k in range(6) for t in ((0, 1, 2), (0, 2, 3))], np.int32)
-    return Mesh(
-        np.array(vertices, np.float32),
-        faces,
-        np.array(normals, np.float32)[faces],
-        np.full((len(faces), 3, 2), 0.5, np.float32),
-    )
+    box = trimesh.creation.box()
+    faces = box.faces.astype(np.int32)
+    return Mesh(box.vertices.astype(np.float32), faces, _flat(box.face_normals.astype(np.float32)), _no_uvs(faces))
 
 
 @cache
 def _directions() -> np.ndarray:
-    """The 42 directions in which Bullet looks for corners of a round shape: an icosahedron's corners and edges."""
+    """Directions (42, 3) in which Bullet looks for a round shape's corners: an icosahedron's corners and edges."""
     angles = np.arange(5) * 2 * np.pi / 5
     height, radius = 1 / np.sqrt(5), 2 / np.sqrt(5)
     ring = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(5, height)], 1)
     corners = np.concatenate([[[0, 0, 1]], ring, -ring, [[0, 0, -1]]])
-    edges = [
-        a + b for i, a in enumerate(corners) for b in corners[:i] if np.linalg.norm(a - b) < 1.1
-    ]  # an edge is 1.05 long
+    # an edge is 1.05 long
+    edges = [a + b for i, a in enumerate(corners) for b in corners[:i] if np.linalg.norm(a - b) < 1.1]
     return _unit(np.concatenate([corners, edges]))
 
 
 def _hull(points: np.ndarray) -> Mesh:
-    """Convex hull around the origin with normals that point away from it, as Bullet draws round shapes."""
+    """Convex hull of points around the origin, with normals that point away from it, as Bullet draws round shapes."""
     points = np.unique(points.astype(np.float32), axis=0)
     faces = ConvexHull(points).simplices.astype(np.int32)
     inward = (_face_normals(points, faces) * points[faces].mean(1)).sum(1) < 0
     faces[inward] = faces[inward, ::-1]
-    return Mesh(points, faces, _unit(points)[faces], np.full((len(faces), 3, 2), 0.5, np.float32))
+    return Mesh(points, faces, _unit(points)[faces], _no_uvs(faces))
 
 
 def _merged(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Equal points become one vertex; vertices in the order in which faces use them, which processors like."""
+    """Merges equal points into one vertex; vertices come in the order in which faces use them, for cache locality."""
     vertices, first, places = np.unique(points[faces.ravel()], axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int32)
     order = np.argsort(first)
     rank[order] = np.arange(len(order), dtype=np.int32)
     return vertices[order].astype(np.float32), rank[places.ravel()].reshape(-1, 3)
+
+
+def _flat(normals: np.ndarray) -> np.ndarray:
+    """A face's normal (F, 3) for each of its corners: (F, 3, 3)."""
+    return np.repeat(normals[:, None], 3, axis=1)
+
+
+def _no_uvs(faces: np.ndarray) -> np.ndarray:
+    """Texture coordinates for faces without texture: (F, 3, 2) float32."""
+    return np.full((len(faces), 3, 2), 0.5, np.float32)
 
 
 def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
