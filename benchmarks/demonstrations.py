@@ -3,8 +3,8 @@
     python benchmarks/demonstrations.py [--starts=200] [--scenes='[A,B,C,D]'] [--assets=DIR] [--workers=2] \
         [--output=FILE.json]
 
-Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. What is in FILE from the same code and
-options is not done again.
+Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. Results in FILE that come from the
+same code and options are kept and not measured again.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 import lerobot_lansar
-from lerobot_lansar.calvin import TASKS
+from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 from lerobot_lansar.demos.demonstrator import demonstrate
 from lerobot_lansar.desk import Desk, SimulationError
 
@@ -29,8 +29,9 @@ SEED = 1_000_000
 class Options:
     """What to measure."""
 
+    # Random starts per task and scene.
     starts: int = 200
-    scenes: list[str] = field(default_factory=lambda: ["A", "B", "C", "D"])
+    scenes: list[str] = field(default_factory=lambda: list(SCENE_NAMES))
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
     workers: int = 2
@@ -38,7 +39,7 @@ class Options:
 
 
 def measure(job: tuple[str, str, str | None, int]) -> tuple[str, str, list[int]]:
-    """Scene, task, and the length of each demonstration, 0 where it failed."""
+    """Scene, task, and the length in frames of each demonstration, 0 where it failed."""
     scene, task, assets, starts = job
     lengths = []
     with Desk(scene, assets, cameras=()) as desk:
@@ -52,7 +53,7 @@ def measure(job: tuple[str, str, str | None, int]) -> tuple[str, str, list[int]]
 
 
 def code_and_options(options: Options) -> str:
-    """A hash of everything that decides the results."""
+    """A hash of the code and the options that decide the results."""
     package = Path(lerobot_lansar.__file__).parent
     digest = hashlib.sha256(f"{options.starts} {options.assets}".encode())
     for file in sorted((*package.glob("desk/*.py"), *package.glob("demos/**/*.py"))):
@@ -61,7 +62,7 @@ def code_and_options(options: Options) -> str:
 
 
 def main() -> None:
-    """Measures what is missing and prints the table."""
+    """Measures what FILE does not hold yet and prints the table."""
     options = draccus.parse(Options)
     state = code_and_options(options)
     known: dict[str, list[int]] = {}

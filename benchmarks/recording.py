@@ -1,10 +1,10 @@
-"""How fast demonstrations are recorded, where the time goes, and what a second worker brings.
+"""How fast demonstrations are recorded, what the time is spent on, and how much a second worker adds.
 
     python benchmarks/recording.py [--assets=DIR] [--episodes=68] [--output=FILE.json]
 
-Shares come from timers around the desk's physics, pictures and oracle, the sampling of start states and the writing of
-files, in one process; planning is what is left. Rates of one and two workers are those of whole `lansar-record`
-commands, start included.
+Shares of the time come from timers around the desk's physics, pictures and oracle, the sampling of start states and the
+writing of files, in one process; the remaining time counts as planning. Rates of one and two workers are those of whole
+`lansar-record` commands, including their start-up.
 """
 
 import json
@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from lerobot_lansar.demos import demonstrator, record
 from lerobot_lansar.demos.calvin_folder import FrameWriter, Unit
+from lerobot_lansar.demos.record_config import RecordConfig
 from lerobot_lansar.desk import Desk
 
 
@@ -33,19 +34,19 @@ class Options:
 
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
-    # Episodes of the timed parts, two of each task; whole commands record six times as many.
+    # Episodes recorded with timers, two of each task by default; whole commands record six times as many.
     episodes: int = 68
     output: Path | None = None
 
 
 def shares(options: Options, cameras: list[str]) -> dict[str, float]:
-    """Frames per second of one process, and the share of each part in its time."""
+    """Frames per second of one process, and the share of each part in the time."""
     spent: dict[str, float] = {}
     inside: list[str] = []
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **keywords: Any) -> Any:
-            if inside:  # counted by the part that called
+            if inside:  # called by another part, which counts the time
                 return function(*arguments, **keywords)
             inside.append(name)
             started = time.perf_counter()
@@ -67,9 +68,7 @@ def shares(options: Options, cameras: list[str]) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         for name, owner, attribute in parts:
             stack.enter_context(patch.object(owner, attribute, timed(name, getattr(owner, attribute))))
-        config = record.RecordConfig(
-            Path(folder) / "desk", episodes=options.episodes, cameras=cameras, assets=options.assets
-        )
+        config = RecordConfig(Path(folder) / "desk", episodes=options.episodes, cameras=cameras, assets=options.assets)
         (config.output_dir / record.STAGING).mkdir(parents=True)
         record.record_unit(config, 0)  # loads the desk
         spent.clear()
@@ -77,7 +76,7 @@ def shares(options: Options, cameras: list[str]) -> dict[str, float]:
         for index in tqdm(range(options.episodes), desc=f"cameras {cameras}", unit="episode", leave=False):
             record.record_unit(config, index)
         whole = time.perf_counter() - started
-        notes = (config.output_dir / record.STAGING).glob("[0-9]*.json")
+        notes = (config.output_dir / record.STAGING).glob(record.NOTES)
         frames = sum(Unit.load(note).frames for note in notes)
     result = {"frames_per_second": frames / whole, "milliseconds_per_frame": 1e3 * whole / frames}
     result |= {f"share_{name.replace(' ', '_')}": spent.get(name, 0.0) / whole for name, *_ in parts}
@@ -85,7 +84,7 @@ def shares(options: Options, cameras: list[str]) -> dict[str, float]:
 
 
 def command(options: Options, cameras: list[str], workers: int) -> float:
-    """Frames per second of a whole lansar-record command."""
+    """Frames per second of a whole `lansar-record` command."""
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "desk"
         words = [

@@ -1,4 +1,4 @@
-"""Writes demonstrations the way CALVIN keeps them on disk: one npz per frame, windows and sentences beside them."""
+"""Writes demonstrations in CALVIN's on-disk format: one npz per frame, windows and sentences beside them."""
 
 import io
 import json
@@ -23,22 +23,22 @@ STATES = ("robot_obs", "scene_obs")
 
 
 def _process() -> str:
-    """A name that no other process has, on any machine."""
+    """A name that no other process on any machine has."""
     return f"{socket.gethostname()}-{os.getpid()}"
 
 
 @dataclass
 class Unit:
-    """Frames that were recorded in one go and lie as `000000.npz` … in a folder of their own.
+    """Frames that were recorded in one go and are kept as `000000.npz` … in a folder of their own.
 
     Attributes:
         scene: The scene's letter.
-        frames: How many there are.
+        frames: Number of frames.
         recordings: [first, end) of each uninterrupted stretch.
-        windows: (first, end, task): frames [first, end) fulfil the task.
+        windows: (first, end, task): the task is fulfilled in frames [first, end).
         tried: Task to how often it was tried.
         accepted: Task to how often the oracle saw it fulfilled.
-        sums: For `robot_obs` and `scene_obs` (as on disk) the sums of values and of squares.
+        sums: For `robot_obs` and `scene_obs` (as on disk) the sums over frames of each value and of its square.
     """
 
     scene: str
@@ -50,7 +50,7 @@ class Unit:
     sums: dict[str, list[list[float]]] = field(default_factory=dict)
 
     def save(self, file: Path) -> None:
-        """Writes it down; the file appears in one go."""
+        """Writes the unit to `file`, which is complete whenever it exists."""
         partial = file.with_name(f"{file.name}-{_process()}.partial")
         partial.write_text(json.dumps(asdict(self)))
         partial.rename(file)
@@ -64,8 +64,7 @@ class Unit:
 class FrameWriter:
     """Writes one npz per frame into `folder`, which appears when the writer is closed without an error.
 
-    `scene_obs` comes with blocks in red, blue, pink order and goes to disk in the scene's original order, which is
-    what CALVIN's own files have.
+    Frames come with blocks in red, blue, pink order in `scene_obs`; files have them in CALVIN's order for the scene.
     """
 
     def __init__(self, folder: Path, scene: Scene):
@@ -81,7 +80,7 @@ class FrameWriter:
         for key in STATES:
             sums = np.stack([data[key], data[key] ** 2])
             self._sums[key] = self._sums.get(key, 0.0) + sums
-        # pictures shrink to a third with the quickest compression, and hardly further with any other
+        # the quickest compression shrinks pictures to a third, and others hardly further
         packed = any(key.startswith(("rgb_", "depth_")) for key in data)
         kind = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
         with zipfile.ZipFile(self._partial / f"{self.frames:06d}.npz", "w", kind, compresslevel=1) as file:
@@ -92,7 +91,7 @@ class FrameWriter:
         self.frames += 1
 
     def sums(self) -> dict[str, list[list[float]]]:
-        """See `Unit`."""
+        """Sums over the frames written so far, as in `Unit`."""
         return {key: value.tolist() for key, value in self._sums.items()}
 
     def __enter__(self) -> "FrameWriter":
@@ -115,15 +114,15 @@ def publish_split(
     config: dict[str, Any],
     sentences: dict[str, str],
 ) -> int:
-    """Builds one split (`training` or `validation`) from recorded units; `target` appears when complete.
+    """Builds one split (`training` or `validation`) from recorded units; `target` appears when it is complete.
 
     Args:
         target: The split's folder; must not exist.
-        units: Folder, unit and the sentences of its windows, in the order in which they get their frame numbers; units
-            of one scene follow each other.
+        units: Folder, unit and the sentences of its windows, in the order of their frame numbers; units of one scene
+            are next to each other.
         first_frame: Number of the first frame.
-        config: Kept in `.hydra/merged_config.yaml`.
-        sentences: The benchmark's sentence of each task, listed by the validation split.
+        config: Written to `.hydra/merged_config.yaml`.
+        sentences: Task to the benchmark's sentence; written to the validation split only.
 
     Returns:
         The number after the last frame.
@@ -136,7 +135,7 @@ def publish_split(
     recordings: list[tuple[int, int]] = []
     windows: list[tuple[int, int]] = []
     tasks: list[str] = []
-    said: list[str] = []
+    spoken: list[str] = []
     scenes: dict[str, list[int]] = {}
     for folder, unit, unit_sentences in tqdm(units, desc=f"writing {target.name}", unit="recording", leave=False):
         for index in range(unit.frames):
@@ -144,11 +143,11 @@ def publish_split(
         recordings += [(number + start, number + end - 1) for start, end in unit.recordings]  # both inclusive
         windows += [(number + start, number + end) for start, end, _ in unit.windows]  # end exclusive
         tasks += [task for *_, task in unit.windows]
-        said += unit_sentences
+        spoken += unit_sentences
         scenes.setdefault(f"calvin_scene_{unit.scene}", [number, 0])[1] = number + unit.frames - 1
         number += unit.frames
     annotations = {
-        "language": {"ann": said, "task": tasks, "emb": np.zeros((len(said), 0), dtype=np.float32)},
+        "language": {"ann": spoken, "task": tasks, "emb": np.zeros((len(spoken), 0), dtype=np.float32)},
         "info": {"episodes": [], "indx": windows},
     }
     _save(partial / "lang_annotations" / "auto_lang_ann.npy", annotations)
@@ -176,21 +175,13 @@ def _statistics(units: Sequence[Unit]) -> dict[str, dict[str, list[float]]]:
     return statistics
 
 
-def group_by_scene(scenes: Sequence[str], count: int) -> list[str]:
-    """The scene of each of `count` units: as even as possible, units of one scene following each other.
-
-    >>> group_by_scene(["A", "B"], 5)
-    ['A', 'A', 'A', 'B', 'B']
-    """
-    return [scenes[index * len(scenes) // count] for index in range(count)]
-
-
 def _save(file: Path, content: dict[str, Any]) -> None:
-    """A pickled dictionary, CALVIN's way of keeping them."""
+    """Pickles a dictionary, as CALVIN's own files do."""
     np.save(file, np.array(content, dtype=object), allow_pickle=True)
 
 
 def _link(source: Path, target: Path) -> None:
+    """Makes a hard link, or a copy where the file system has no hard links."""
     try:
         os.link(source, target)
     except OSError:

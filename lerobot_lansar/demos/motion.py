@@ -1,4 +1,4 @@
-"""From waypoints to actions: a hand that speeds up and slows down smoothly and stays on its line."""
+"""From waypoints to actions: a hand that speeds up and slows down smoothly along straight lines."""
 
 import numpy as np
 
@@ -6,17 +6,17 @@ from ..calvin import POSE_UNITS, TCP_POSE, wrap_angle
 from .moves import Waypoint, turned
 
 RESPONSE = 0.5
-"""Share of the commanded way that the arm goes in one control step, in translation and rotation (measured)."""
+"""Fraction of the commanded distance that the arm covers in one control step, also for angles (measured)."""
 TOP_SPEED, TOP_TURN = 0.0095, 0.024
-"""m and rad per control step: what the largest relative action gives."""
+"""m and rad per control step: those of the largest relative action."""
 ACCELERATION, TURN_ACCELERATION = 0.0015, 0.004
 """m and rad per control step squared."""
 LEAD = np.array([0.02] * 3 + [0.08] * 3)
-"""How far (m, rad) the planned pose may be ahead of the real one when something resists."""
+"""Maximum distance (m, rad) of the planned pose from the real one, when something holds the hand back; (6,)."""
 
 
 def _difference(target: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """target - pose for poses of xyz and euler, (6,); the yaw never the way on which the last joint ends."""
+    """target - pose for poses of xyz and euler, (6,); yaw turns the way that keeps the last joint within its limits."""
     way = target - pose
     way[3:5] = wrap_angle(way[3:5])
     way[5] = turned(target[5]) - turned(pose[5])
@@ -26,12 +26,12 @@ def _difference(target: np.ndarray, pose: np.ndarray) -> np.ndarray:
 class Motion:
     """Follows waypoints with a planned pose that moves with limited speed and acceleration.
 
-    The planned pose runs along straight lines, at most `LEAD` ahead of the hand; commands undo half of the
-    hand's deviation from it at every step. All commands stay within a relative action of +-1 per axis.
+    The planned pose moves along straight lines, at most `LEAD` ahead of the hand. Each command corrects half of the
+    hand's deviation from it. All commands stay within a relative action of +-1 per axis.
 
     Args:
         robot_obs: (15,), where the motion begins.
-        speed: Fraction of the top speeds.
+        speed: Fraction of `TOP_SPEED` and `TOP_TURN`.
     """
 
     def __init__(self, robot_obs: np.ndarray, speed: float):
@@ -40,7 +40,7 @@ class Motion:
         self._velocity: np.ndarray = np.zeros(6)
 
     def error(self, waypoint: Waypoint, robot_obs: np.ndarray) -> tuple[float, float]:
-        """What is left to the waypoint: m, and the largest angle in rad."""
+        """Distance left to the waypoint (m), and the largest angle left (rad)."""
         way = _difference(np.concatenate([waypoint.position, waypoint.euler]), robot_obs[TCP_POSE])
         return float(np.linalg.norm(way[:3])), float(np.abs(way[3:]).max())
 
@@ -64,7 +64,7 @@ class Motion:
 
 
 def _accelerate(velocity: np.ndarray, left: np.ndarray, top: float, acceleration: float) -> np.ndarray:
-    """The next velocity (3,) on the way `left`: towards its end, in time to stop there."""
+    """The next velocity (3,) towards the end of the distance `left` (3,), slow enough to stop there."""
     distance = float(np.linalg.norm(left))
     wanted = left * min(top, np.sqrt(2 * acceleration * distance), distance) / max(distance, 1e-9)
     change = wanted - velocity
@@ -73,11 +73,11 @@ def _accelerate(velocity: np.ndarray, left: np.ndarray, top: float, acceleration
 
 
 class Disturbance:
-    """Noise on executed actions: a little at every step, pushes of four steps and slips of the gripper at random.
+    """Noise on executed actions: a little at every step, and random pushes of four steps and slips of the gripper.
 
     Args:
         noise: Standard deviation in relative action units.
-        rng: Decides everything.
+        rng: The only source of randomness.
     """
 
     def __init__(self, noise: float, rng: np.random.Generator):
@@ -86,7 +86,7 @@ class Disturbance:
         self._pushed = 0
 
     def of(self, action: np.ndarray, careful: bool) -> np.ndarray:
-        """The action that is really executed, (7,); half the noise and no push while `careful`."""
+        """The action to execute instead of `action`, (7,); with half the noise and no push while `careful`."""
         if self._rng.uniform() < 0.025 and self._pushed == 0 and not careful:
             self._push, self._pushed = self._rng.normal(0, 4 * self._noise, 6), 4
         slips = self._rng.uniform() < 0.002 * self._noise
@@ -94,4 +94,4 @@ class Disturbance:
         units += self._push if self._pushed and not careful else 0.0
         gripper = -action[6:] if slips else action[6:]
         self._pushed = max(self._pushed - 1, 0)
-        return np.concatenate([action[:6] + units * POSE_UNITS, gripper])
+        return np.concatenate([action[TCP_POSE] + units * POSE_UNITS, gripper])

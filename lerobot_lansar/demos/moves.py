@@ -1,7 +1,7 @@
-"""What skills are made of: waypoints, what a skill sees of the desk, and the few moves that all of them share.
+"""What skills are built from: waypoints, a skill's view of the desk, and the few moves that all skills share.
 
 Positions in metres in the world frame, angles in radians. A hand that points straight down has euler (pi, 0, yaw);
-`pointing` leans it.
+`pointing` gives the euler angles of a leaning hand.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,21 +10,23 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calvin import COLORS, DRAWER, GRIPPER_ACTION, GRIPPER_WIDTH, block_pose
+from ..calvin import COLORS, DRAWER, GRIPPER_ACTION, GRIPPER_WIDTH, SLIDE, TCP_POSE, block_pose
 from ..desk.robot import BASE_POSITION
-from ..desk.scenes import BLOCK_LENGTHS, BLOCK_SIDE, Scene
+from ..desk.scenes import BLOCK_LENGTHS, BLOCK_SIDE, TABLE_Z, Scene
 
 OPEN, CLOSED = 1.0, -1.0
 FORWARD = np.pi / 2
-"""The yaw (rad) of a hand at rest: the gripper camera looks at the cabinet."""
+"""Yaw (rad) of a hand at rest: the gripper camera looks at the cabinet."""
 YAWS = (FORWARD - 2.0, FORWARD + 2.5)
-"""Yaws (rad) that the arm reaches everywhere over the table; beyond them its last joint ends."""
+"""Range of yaws (rad) that the arm reaches everywhere over the table; its last joint turns no further."""
 INTO_CABINET = 0.5
 """How far (rad) a hand leans forward to reach past the cabinet's lid and door."""
 TABLE_FRONT = -0.18
-"""y of the table's front edge (m): the drawer comes out from under it."""
+"""y of the table's front edge (m), from under which the drawer comes out."""
 TRIES = 4
-"""How often a skill begins anew before it gives up."""
+"""How often a skill starts over before it gives up."""
+FALLEN = 0.30
+"""A block whose centre is below this height (m) has fallen off the desk."""
 
 Skill = Callable[["View"], Iterator["Waypoint"]]
 
@@ -37,10 +39,11 @@ class Waypoint:
         position: (3,) m.
         euler: (3,) rad.
         gripper: -1 closed, +1 open.
-        slow: Fraction of the episode's speed: under 1 while touching things.
-        tolerance: How near counts as there (m).
+        slow: Fraction of the episode's speed; below 1 while touching things.
+        tolerance: Distance (m) at which the hand counts as arrived.
         hold: Control steps to stay after arriving.
-        keep: Asked at every step; once it is false the way is given up and the skill looks anew.
+        keep: Called at every step; once it returns False, the waypoint is given up and the skill looks at the desk
+            again.
     """
 
     position: np.ndarray
@@ -53,7 +56,7 @@ class Waypoint:
 
     @property
     def careful(self) -> bool:
-        """Whether the hand reaches for something, touches it, or closes and opens around it."""
+        """Whether the hand is reaching for something, touching it, or opening or closing around it."""
         return self.slow < 1 or self.hold > 0
 
 
@@ -63,11 +66,11 @@ class Style:
 
     Attributes:
         speed: Fraction of the top speed, 0.0095 m per control step and 0.024 rad.
-        cruise: Height (m) of the TCP on its way over the table.
-        yaw: Deviation (rad) of the hand's yaw where any will do.
-        idle_gripper: Open or closed on the way to what needs no particular one.
+        cruise: Height (m) of the TCP while it travels over the table.
+        yaw: Deviation (rad) of the hand's yaw where any yaw will do.
+        idle_gripper: Open or closed while the hand travels and either will do.
         pauses: Probability of waiting up to 8 steps at a waypoint.
-        spread: 0 to 1, how far contact points and approach heights scatter.
+        spread: How far contact points and approach heights scatter, 0 to 1.
     """
 
     speed: float = 0.9
@@ -92,7 +95,7 @@ class Style:
 
 @dataclass
 class View:
-    """What a skill sees: the scene's fixed numbers and the latest `robot_obs` (15,) and `scene_obs` (24,)."""
+    """What a skill sees: the scene's geometry and the latest `robot_obs` (15,) and `scene_obs` (24,)."""
 
     scene: Scene
     robot_obs: np.ndarray
@@ -103,7 +106,22 @@ class View:
     @property
     def tcp(self) -> np.ndarray:
         """TCP position, (3,) m."""
-        return self.robot_obs[:3]
+        return self.robot_obs[TCP_POSE][:3]
+
+    @property
+    def euler(self) -> np.ndarray:
+        """TCP euler angles, (3,) rad."""
+        return self.robot_obs[TCP_POSE][3:].copy()
+
+    @property
+    def yaw(self) -> float:
+        """The hand's yaw (rad), in the interval of `turned`."""
+        return turned(self.euler[2])
+
+    @property
+    def slide(self) -> float:
+        """Position of the cabinet's door (m): it moves to -x as this grows."""
+        return float(self.scene_obs[SLIDE])
 
     @property
     def drawer(self) -> float:
@@ -129,14 +147,19 @@ class View:
 
     def lost(self, color: str) -> bool:
         """Whether the block fell off the desk."""
-        return bool(self.block(color)[2] < 0.30)
+        return bool(self.block(color)[2] < FALLEN)
+
+    def lies_on(self, upper: str, lower: str, height: float = np.inf) -> bool:
+        """Whether a block's centre is above another's: by 0.03 m to `height` (m), and less than 0.05 m to the side."""
+        way = self.block(upper)[:3] - self.block(lower)[:3]
+        return bool(0.03 < way[2] < height and np.linalg.norm(way[:2]) < 0.05)
 
     def held(self) -> str | None:
-        """The block in the hand, if there is one."""
+        """The block in the hand, if any."""
         return next((color for color in COLORS if self.holds(color)), None)
 
     def scatter(self, spread: float) -> float:
-        """A random number within +-`spread` (m or rad), less when the style asks for less variety."""
+        """A random number within +-`spread` (m or rad), scaled by the style's own spread."""
         return float(self.rng.uniform(-spread, spread) * self.style.spread)
 
     def go(
@@ -146,7 +169,7 @@ class View:
         euler: np.ndarray | None = None,
         **options: float | Callable[[], bool] | None,
     ) -> Waypoint:
-        """A waypoint; without `euler` the hand points down and leans outward where the arm has to stretch."""
+        """A waypoint; without `euler` the hand points down, and leans outward where the arm has to stretch."""
         xyz = np.asarray(position, float)
         if euler is None:
             euler = pointing(FORWARD + self.style.yaw, *stretch(xyz))
@@ -167,7 +190,7 @@ def approach(euler: np.ndarray) -> np.ndarray:
 def stretch(position: np.ndarray) -> np.ndarray:
     """How far (rad, along x and y) the hand must lean outward for the arm to reach a point at table height.
 
-    Straight down the arm reaches 0.76 m from its base, leaning by 0.55 rad 0.88 m.
+    With the hand straight down the arm reaches 0.76 m from its base; with the hand leaning by 0.55 rad, 0.88 m.
     """
     way = position[:2] - np.array(BASE_POSITION[:2])
     distance = float(np.linalg.norm(way))
@@ -175,25 +198,25 @@ def stretch(position: np.ndarray) -> np.ndarray:
 
 
 def turned(yaw: float) -> float:
-    """The same yaw in the interval that the last joint passes through without turning back: [FORWARD - 2.2, +4.1)."""
+    """The same yaw in [FORWARD - 2.2, FORWARD + 4.1), which the last joint passes through without turning back."""
     return float((yaw - FORWARD + 2.2) % (2 * np.pi) - 2.2 + FORWARD)
 
 
 def in_cabinet(position: np.ndarray) -> bool:
-    """Whether a TCP there is among the cabinet's walls."""
+    """Whether a TCP at this position is inside the cabinet."""
     return bool(position[1] > -0.02 and position[2] < 0.64)
 
 
 def retreat(view: View, gripper: float, keep: Callable[[], bool] | None = None) -> Iterator[Waypoint]:
-    """Out of the cabinet the way the fingers came in, up from anything low."""
+    """Out of the cabinet the way the fingers came in, or up from anything low."""
     options = {"tolerance": 0.03, "keep": keep}
     if in_cabinet(view.tcp):
-        back = view.tcp - 0.12 * approach(view.robot_obs[3:6])
-        yield view.go(back, gripper, view.robot_obs[3:6].copy(), **options)
-        yield view.go((view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.robot_obs[3:6].copy(), **options)
+        back = view.tcp - 0.12 * approach(view.euler)
+        yield view.go(back, gripper, view.euler, **options)
+        yield view.go((view.tcp[0], -0.10, max(view.tcp[2], 0.60)), gripper, view.euler, **options)
     elif view.tcp[2] < view.style.cruise - 0.03:
         above = (view.tcp[0], min(view.tcp[1], -0.05), view.style.cruise)
-        yield view.go(above, gripper, view.robot_obs[3:6].copy(), **options)
+        yield view.go(above, gripper, view.euler, **options)
 
 
 def travel(
@@ -203,7 +226,7 @@ def travel(
     euler: np.ndarray | None = None,
     keep: Callable[[], bool] | None = None,
 ) -> Iterator[Waypoint]:
-    """Over everything to a place above `position`; ends at cruising height or at the place if that is higher."""
+    """Travels over everything to above `position`; ends at cruising height, or at `position` if that is higher."""
     x, y, z = position
     if in_cabinet(view.tcp) and y > -0.02 and abs(view.tcp[0] - x) < 0.08:
         return
@@ -213,15 +236,29 @@ def travel(
 
 
 def lying(pose: np.ndarray) -> tuple[float, bool]:
-    """Yaw (rad) of a block's long axis, and whether that axis is horizontal; of another axis if the block stands."""
+    """Yaw (rad) of a block's long axis, and whether that axis is horizontal; of another axis if it is not."""
     axes = Rotation.from_euler("xyz", pose[3:]).as_matrix()
     horizontal = bool(abs(axes[2, 0]) < 0.7)
     axis = axes[:, 0] if horizontal else axes[:, 1]
     return float(np.arctan2(axis[1], axis[0])), horizontal
 
 
+def on_table(pose: np.ndarray) -> bool:
+    """Whether a block lies on the table top in front of the cabinet."""
+    return bool(abs(pose[2] - TABLE_Z) < 0.035 and -0.20 < pose[1] < 0.02)
+
+
+def half_width(view: View, color: str, direction: np.ndarray) -> float:
+    """Half of a lying block's extent along a horizontal direction (m)."""
+    yaw, horizontal = lying(view.block(color))
+    length = view.length(color) if horizontal else BLOCK_SIDE
+    along = abs(np.cos(yaw) * direction[0] + np.sin(yaw) * direction[1])
+    across = abs(-np.sin(yaw) * direction[0] + np.cos(yaw) * direction[1])
+    return float(length * along + BLOCK_SIDE * across) / 2
+
+
 def grasp_yaws(view: View, color: str) -> list[float]:
-    """Yaws that close the fingers on a block, the handiest first; none that the wrist does not reach.
+    """Yaws (rad) at which the fingers can close on a block, the most convenient first; only those in `YAWS`.
 
     The fingers fit over sides of up to 0.056 m.
     """
@@ -229,12 +266,12 @@ def grasp_yaws(view: View, color: str) -> list[float]:
     yaw, horizontal = lying(pose)
     only_short = horizontal and view.length(color) > 0.06
     yaws = {turned(yaw + k * np.pi / 2) for k in range(4) if k % 2 == 0 or not only_short}
-    now = turned(view.robot_obs[5])
+    now = view.yaw
 
-    def badness(candidate: float) -> float:
-        # the hand is 0.2 m wide across its fingers: near the cabinet it must stand along it
+    def inconvenience(candidate: float) -> float:
+        # the hand is 0.2 m wide across its fingers: near the cabinet it must stay parallel to it
         sideways = abs(np.sin(candidate - FORWARD)) * (3.0 if pose[1] > -0.10 else 0.5)
         long_side = 0.5 * (horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE)
         return abs(candidate - now) + sideways + long_side
 
-    return sorted((y for y in yaws if YAWS[0] <= y <= YAWS[1]), key=badness)
+    return sorted((y for y in yaws if YAWS[0] <= y <= YAWS[1]), key=inconvenience)

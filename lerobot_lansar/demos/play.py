@@ -2,25 +2,24 @@
 short ones around each fulfilled task, or whole subtasks, from the command to its fulfilment."""
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
-from ..calvin import CHAIN_LENGTH, COLORS, GRIPPER_ACTION, STEPS_PER_COMMAND, SWITCH, TASKS, WINDOW_FRAMES
+from ..calvin import CHAIN_LENGTH, COLORS, GRIPPER_ACTION, STEPS_PER_COMMAND, SWITCH, TASKS, WINDOW_FRAMES, Task
 from ..desk import Desk, SimulationError, completed_tasks, is_fulfilled
 from ..desk.desk import Observation
-from ..desk.oracle import DRAWER, PLANK, TABLE, Condition, Snapshot, is_stacked
-from ..desk.scenes import DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
-from ..desk.starts import REACH, TABLE_Z, beside_door, sample_start
+from ..desk.oracle import DRAWER, PLANK, TABLE, Snapshot, is_stacked
+from ..desk.scenes import DRAWER_TRAVEL, REACH, SWITCH_TRAVEL, TABLE_Z, Scene, beside_door
+from ..desk.starts import sample_start
 from .calvin_folder import FrameWriter, Unit
-from .demonstrator import AFTERWARDS, carry_out
-from .moves import Skill, Style, View, Waypoint, lying
+from .demonstrator import AFTERWARDS, Frame, carry_out
+from .moves import FALLEN, Style, View, Waypoint, lying
 from .skills import SKILLS
-from .skills.blocks import put_down
+from .skills.table import put_down
 
-_SHORTEST = 32
+_SHORTEST = 32  # frames in a window, unless its recording began later
 _PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each frame 1.58 times
-_LATEST = 10  # frames after the fulfilment at which a window ends at the latest
+_LATEST = 10  # frames after the fulfilment in which a window must end
 
 
 def record_play(
@@ -34,13 +33,13 @@ def record_play(
 ) -> Unit:
     """Plays for `frames` control steps and writes all of them.
 
-    A task is chosen among those that are feasible, carried out, and followed by a moment of rest. When a block fell
-    off the desk or the physics diverged, the desk is reset to a random state and a new recording begins.
+    One of the feasible tasks is chosen, carried out, and followed by a short rest. When a block fell off the desk or
+    the physics diverged, the desk is reset to a random state and a new recording begins.
 
     Args:
         desk: Any desk; the frames hold the pictures of its cameras.
         frames: How many to record.
-        rng: Decides everything.
+        rng: The only source of randomness.
         writer: Receives the frames.
         noise, variety: As for `demonstrator.demonstrate`.
         whole: The windows are whole subtasks instead of CALVIN's.
@@ -77,76 +76,68 @@ def _play(
     variety: float,
     unit: Unit,
     whole: bool,
-) -> Iterator[tuple[dict[str, np.ndarray], Snapshot, tuple[int, str] | None]]:
-    """One uninterrupted recording. Yields each frame, its snapshot, and of the task first seen fulfilled in it the
-    frame in which it was begun and its name.
+) -> Iterator[tuple[Frame, Snapshot, tuple[int, str] | None]]:
+    """One uninterrupted recording; counts tasks tried and accepted in `unit`.
+
+    Yields:
+        Each frame, its snapshot, and, if a task is first seen fulfilled in it, the frame in which the task was begun
+        and its name.
     """
     obs = desk.reset(*sample_start(desk, str(rng.choice(list(TASKS))), rng))
-    last, before = desk.snapshot(), None
+    last = desk.snapshot()
+    task: str | None = None
     left, carried_out = frames, 0
+    before: str | None = None
     while left > 0:
-        tasks = feasible_tasks(desk.scene, last, obs)
-        skill: Skill
-        oracle: Condition
-        if tasks:
-            task = _choose(tasks, before, rng)
+        feasible = feasible_tasks(desk.scene, last, obs)
+        task = _choose(feasible, before, rng) if feasible else None
+        if task is not None:
             unit.tried[task] = unit.tried.get(task, 0) + 1
-            skill, oracle, before = SKILLS[task], partial(is_fulfilled, task), task
-        else:
-            task, skill, oracle = "", put_down, _never
-        start, began, done = last, frames - left, False
+            before = task
+        start, began = last, frames - left
+        done, satisfied = False, 0
         rest = int(rng.integers(1, 6) if whole else rng.integers(2, 20))
-        for moves, limit, stop in ((skill, STEPS_PER_COMMAND, oracle), (_resting, rest, _never)):
-            steps = carry_out(
-                desk,
-                obs,
-                moves,
-                rng,
-                variety=variety,
-                noise=noise,
-                steps=min(left, limit),
-                fulfilled=partial(stop, start),
-            )
-            for frame, after, now in steps:
-                first = not done and oracle(start, last)
+        acting = SKILLS[task] if task is not None else put_down
+        for skill, limit in ((acting, STEPS_PER_COMMAND), (_rest, rest)):
+            for frame, after, now in carry_out(
+                desk, obs, skill, rng, variety=variety, noise=noise, steps=min(left, limit)
+            ):
+                first = satisfied > 0 and not done
                 done = done or first
-                yield frame, last, (began, task) if first else None
+                yield frame, last, (began, str(task)) if first else None
                 obs, last, left = after, now, left - 1
-        if done:
+                satisfied = satisfied + 1 if task is not None and is_fulfilled(task, start, now) else 0
+                if skill is acting and satisfied > AFTERWARDS:
+                    break
+        if done and task is not None:
             unit.accepted[task] = unit.accepted.get(task, 0) + 1
         carried_out += 1
-        if any(block.position[2] < 0.30 for block in last.blocks.values()):
+        if any(block.position[2] < FALLEN for block in last.blocks.values()):
             return
         if whole and (not done or carried_out == CHAIN_LENGTH):
             return
 
 
-def _never(start: Snapshot, end: Snapshot) -> bool:
-    return False
+def _rest(view: View) -> Iterator[Waypoint]:
+    """Stay in place, with the hand as it is."""
+    yield view.go(view.tcp.copy(), float(view.robot_obs[GRIPPER_ACTION]), view.euler, hold=STEPS_PER_COMMAND)
 
 
-def _resting(view: View) -> Iterator[Waypoint]:
-    """Stay where you are, with the hand as it is."""
-    yield view.go(
-        view.tcp.copy(), float(view.robot_obs[GRIPPER_ACTION]), view.robot_obs[3:6].copy(), hold=STEPS_PER_COMMAND
-    )
+def _choose(tasks: list[Task], before: str | None, rng: np.random.Generator) -> str:
+    """The name of one task: kinds and places are equally likely, and none comes twice in a row if others can."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for task in sorted(tasks, key=_color_and_side):
+        if task.name != before or len(tasks) == 1:
+            groups.setdefault((task.kind, task.place or ""), []).append(task.name)
+    group = groups[sorted(groups)[rng.choice(len(groups))]]
+    return str(rng.choice(group))
 
 
-def _choose(tasks: list[str], before: str | None, rng: np.random.Generator) -> str:
-    """One of the tasks: kinds of task are equally likely, not tasks, and none comes twice in a row if others can."""
-    kinds: dict[tuple[str, str], list[str]] = {}
-    for task in tasks:
-        if task != before or len(tasks) == 1:
-            kinds.setdefault((TASKS[task].kind, TASKS[task].place or ""), []).append(task)
-    listed = kinds[sorted(kinds)[rng.choice(len(kinds))]]
-    return str(rng.choice(listed))
+def _color_and_side(task: Task) -> tuple[int, str]:
+    return COLORS.index(task.color) if task.color is not None else 0, task.side or ""
 
 
-def _held(snapshot: Snapshot) -> str | None:
-    return next((color for color, block in snapshot.blocks.items() if block.bodies == {"robot"}), None)
-
-
-def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[str]:
+def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[Task]:
     """The tasks that can begin now, by CALVIN's rules (a block in the hand can only be placed or stacked) and by what
     a hand can reach.
 
@@ -154,71 +145,88 @@ def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[s
         scene: The desk's scene.
         snapshot, obs: The present state.
     """
-    held = _held(snapshot)
     view = View(scene, obs["robot_obs"], obs["scene_obs"], np.random.default_rng(0), Style())
-    on_table = [c for c in COLORS if _free_on_table(view, snapshot, c)]
-    slide, drawer = snapshot.slide, snapshot.drawer
-    at_end = min(slide, scene.slide_travel - slide) < 0.03
-    if held is not None:
-        if not view.holds(held):
-            return []  # it hangs on the hand somehow
-        others = [c for c in on_table if c != held]
-        return [
-            *(["place_in_slider"] if at_end else []),
-            *(["place_in_drawer"] if drawer > 0.15 else []),
-            *(["stack_block"] if others else []),
-        ]
-    tasks = [
-        *(["move_slider_left"] if scene.slide_travel - slide > 0.16 else []),
-        *(["move_slider_right"] if slide > 0.16 else []),
-        *(["open_drawer"] if DRAWER_TRAVEL - drawer > 0.13 else []),
-        *(["close_drawer"] if drawer > 0.13 else []),
-        "turn_off_lightbulb" if snapshot.bulb else "turn_on_lightbulb",
-        "turn_off_led" if snapshot.led else "turn_on_led",
-    ]
-    switch = view.scene_obs[SWITCH]
-    if snapshot.bulb != (switch > SWITCH_TRAVEL / 2):
-        tasks.remove("turn_off_lightbulb" if snapshot.bulb else "turn_on_lightbulb")
-    for color in on_table:
-        tasks.append(f"lift_{color}_block_table")
-        tasks += [f"rotate_{color}_block_{side}" for side in ("left", "right")]
-        for side, sign in (("left", -1), ("right", 1)):
-            if abs(view.block(color)[0] + sign * 0.11) < REACH:
-                tasks.append(f"push_{color}_block_{side}")
-    if drawer > 0.15 and any(abs(view.block(c)[0] - scene.drawer_x) < 0.3 for c in on_table):
-        tasks.append("push_into_drawer")
-    for color in COLORS:
-        block, (x, y, z) = snapshot.blocks[color], view.block(color)[:3]
-        beside = beside_door(scene, slide, x)
-        flat = lying(view.block(color))[1]
-        if PLANK in block.contacts and not _under_another(snapshot, color) and beside and y < 0.125 and flat:
-            tasks.append(f"lift_{color}_block_slider")
-        if DRAWER in block.contacts and not _under_another(snapshot, color) and y < -0.215 and z < TABLE_Z - 0.05:
-            tasks.append(f"lift_{color}_block_drawer")
-    if any(is_stacked(block) for block in snapshot.blocks.values()):
-        tasks.append("unstack_block")
-    return tasks
+    held = next((color for color, block in snapshot.blocks.items() if block.bodies == {"robot"}), None)
+    if held is None:
+        return [task for task in TASKS.values() if _is_feasible(task, view, snapshot)]
+    if not view.holds(held):
+        return []  # the block hangs on the hand, but not between the fingers
+    return [task for task in TASKS.values() if _is_feasible_holding(task, held, view, snapshot)]
 
 
-def _free_on_table(view: View, snapshot: Snapshot, color: str) -> bool:
-    block, pose = snapshot.blocks[color], view.block(color)
-    on_it = block.contacts == {TABLE} and abs(pose[2] - TABLE_Z) < 0.03
-    return bool(on_it and abs(pose[0]) < REACH and -0.19 < pose[1] < 0.0)
+def _is_feasible_holding(task: Task, held: str, view: View, snapshot: Snapshot) -> bool:
+    """Whether a task can begin with a block in the hand."""
+    match task.kind, task.place:
+        case "place_block", "slider":
+            return min(view.slide, view.scene.slide_travel - view.slide) < 0.03
+        case "place_block", "drawer":
+            return view.drawer > 0.15
+        case "stack_block", _:
+            return any(_free_on_table(color, view, snapshot) for color in COLORS if color != held)
+    return False
 
 
-def _under_another(snapshot: Snapshot, color: str) -> bool:
-    position = snapshot.blocks[color].position
-    above = [snapshot.blocks[c].position - position for c in COLORS if c != color]
-    return any(gap[2] > 0.03 and np.linalg.norm(gap[:2]) < 0.05 for gap in above)
+def _is_feasible(task: Task, view: View, snapshot: Snapshot) -> bool:
+    """Whether a task can begin with an empty hand."""
+    switched_on = view.scene_obs[SWITCH] > SWITCH_TRAVEL / 2
+    match task.kind:
+        case "move_slider":
+            return (view.slide if task.side == "right" else view.scene.slide_travel - view.slide) > 0.16
+        case "open_drawer":
+            return DRAWER_TRAVEL - view.drawer > 0.13
+        case "close_drawer":
+            return view.drawer > 0.13
+        case "turn_on_lightbulb":
+            return not snapshot.bulb and not switched_on
+        case "turn_off_lightbulb":
+            return snapshot.bulb and bool(switched_on)
+        case "turn_on_led":
+            return not snapshot.led
+        case "turn_off_led":
+            return snapshot.led
+        case "unstack_block":
+            return any(is_stacked(block) for block in snapshot.blocks.values())
+        case "push_into_drawer":
+            near = [color for color in COLORS if abs(view.block(color)[0] - view.scene.drawer_x) < 0.3]
+            return view.drawer > 0.15 and any(_free_on_table(color, view, snapshot) for color in near)
+        case "rotate_block":
+            return _free_on_table(str(task.color), view, snapshot)
+        case "push_block":
+            end = view.block(str(task.color))[0] + (0.11 if task.side == "right" else -0.11)
+            return _free_on_table(str(task.color), view, snapshot) and bool(abs(end) < REACH)
+        case "lift_block":
+            return _can_be_lifted(str(task.color), str(task.place), view, snapshot)
+    return False
+
+
+def _can_be_lifted(color: str, place: str, view: View, snapshot: Snapshot) -> bool:
+    """Whether a block lies in that place, with nothing on it, and where a hand can take it."""
+    if place == "table":
+        return _free_on_table(color, view, snapshot)
+    (x, y, z), contacts = view.block(color)[:3], snapshot.blocks[color].contacts
+    if any(view.lies_on(other, color) for other in COLORS if other != color):
+        return False
+    if place == "drawer":
+        return DRAWER in contacts and bool(y < -0.215 and z < TABLE_Z - 0.05)
+    flat = lying(view.block(color))[1]
+    return PLANK in contacts and bool(y < 0.125) and flat and beside_door(view.scene, view.slide, x)
+
+
+def _free_on_table(color: str, view: View, snapshot: Snapshot) -> bool:
+    """Whether a block touches nothing but the table and lies where a hand can push and take it."""
+    x, y, z = view.block(color)[:3]
+    on_it = snapshot.blocks[color].contacts == {TABLE} and abs(z - TABLE_Z) < 0.03
+    return bool(on_it and abs(x) < REACH and -0.19 < y < 0.0)
 
 
 def whole_windows(snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]]) -> list[tuple[int, int, str]]:
-    """Windows from the frame in which a task was begun until it is, and for some frames has been, fulfilled: what a
-    policy has to do in a rollout of several subtasks, from where the one before left the desk.
+    """Windows from the frame in which a task was begun until it has stayed fulfilled for `AFTERWARDS` frames.
+
+    That is what a policy does in a rollout of several subtasks: it begins where the subtask before left the desk.
 
     Args:
-        snapshots: Of each frame of one recording.
-        fulfilled: (began, frame, task): when tasks were begun and first seen fulfilled.
+        snapshots: One per frame of one recording.
+        fulfilled: (began, frame, task): the frames in which a task was begun and first seen fulfilled.
 
     Returns:
         (first, end, task) with an exclusive end, in order. Tasks that did not stay fulfilled give none.
@@ -234,12 +242,12 @@ def whole_windows(snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str
 def cut_windows(
     snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]], rng: np.random.Generator
 ) -> list[tuple[int, int, str]]:
-    """Windows of at most 64 frames between whose first and last frame exactly one task was fulfilled.
+    """Windows of at most `WINDOW_FRAMES` frames between whose first and last frame exactly one task was fulfilled.
 
     Args:
-        snapshots: Of each frame of one recording.
-        fulfilled: (began, frame, task): when tasks were begun and first seen fulfilled.
-        rng: Decides where windows begin and end around these frames.
+        snapshots: One per frame of one recording.
+        fulfilled: (began, frame, task): the frames in which a task was begun and first seen fulfilled.
+        rng: The only source of randomness: where windows begin and end around these frames.
 
     Returns:
         (first, end, task) with an exclusive end, in order; windows may overlap. Tasks that took longer than a window,

@@ -1,4 +1,4 @@
-"""`lansar-play`: drive the gripper by keyboard, see what the oracle says, record demonstrations of your own."""
+"""`lansar-play`: drive the gripper by keyboard, see the oracle's verdicts, record demonstrations of your own."""
 
 import os
 import re
@@ -47,27 +47,30 @@ HELP = (
     "BACKSPACE   new start     ESC   quit",
 )
 SIZE = 600
+"""Width and height of the large picture, in pixels."""
+STAGING = ".playing"
+"""The folder in OUTPUT_DIR in which kept demonstrations wait."""
 DEMONSTRATION = "a8 w6 f7 wait4 r4 space wait10"
-"""What is played without a display and without `--keys`: the LED's button is pressed, the hand closes."""
+"""Keys pressed if there is neither a display nor `--keys`: the hand presses the LED's button and closes."""
 
 
 @dataclass
-class PlayConfig:
-    """Opens a desk for driving by keyboard; without a display, writes a video of given keys instead."""
+class TeleopConfig:
+    """Opens a desk for driving by keyboard; without a display, presses given keys and writes a video instead."""
 
     scene: str = "D"
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
     # fast, fast_gl, tiny or egl.
     renderer: str = "fast"
-    # Start in a random state from which this task can be done; everything closed and off by default.
+    # Start in a random state in which this task is feasible; everything closed and off by default.
     task: str | None = None
     seed: int = 0
     # Keep demonstrations here, in CALVIN's format: ENTER begins one, ENTER after a fulfilled task keeps it.
     output_dir: Path | None = None
     # Keys to press instead of a keyboard: 'd10 f5 space wait20 enter', a number for how many steps each is held.
     keys: str | None = None
-    # Write what is seen to this mp4; play.mp4 when keys are played or there is no display.
+    # Write what the person sees to this mp4; by default play.mp4 with --keys or without a display, else none.
     video: Path | None = None
 
     def check(self) -> None:
@@ -82,14 +85,14 @@ class PlayConfig:
 
 
 class Session:
-    """A desk driven by keys, with everything fulfilled since the last mark.
+    """A desk driven by keys, with the tasks fulfilled since the last mark.
 
     Args:
         config: The command's options.
         desk: With both cameras.
     """
 
-    def __init__(self, config: PlayConfig, desk: Desk):
+    def __init__(self, config: TeleopConfig, desk: Desk):
         self.config, self.desk = config, desk
         self.kept: list[tuple[Path, Unit, list[str]]] = []
         self.recording = False
@@ -98,7 +101,7 @@ class Session:
         self.begin()
 
     def begin(self) -> None:
-        """A new start state."""
+        """Resets the desk to a new start state."""
         rng = np.random.default_rng(self._starts)
         if self.config.task is None:
             self.obs = self.desk.reset(seed=self._starts)
@@ -111,26 +114,26 @@ class Session:
         self.recording = False
 
     def mark(self) -> None:
-        """From here on the oracle judges, and a recording begins."""
+        """The oracle judges from here on, and a recording begins here."""
         self.fulfilled: dict[str, int] = {}
         self.steps = 0
         self._start = self.desk.snapshot()
         self._rows: list[dict[str, np.ndarray]] = []
 
     def press(self, key: str) -> None:
-        """A key that is pressed rather than held: space, enter, backspace."""
+        """Handles a key that is pressed rather than held: space, enter or backspace."""
         if key == "space":
             self._gripper = -self._gripper
         elif key == "backspace":
             self.begin()
         elif key == "enter":
             if self.recording and self.fulfilled and self.config.output_dir is not None:
-                self._keep(self.config.output_dir)  # of what still holds
+                self._keep(self.config.output_dir)
             self.recording = not self.recording and self.config.output_dir is not None
             self.mark()
 
     def step(self, held: Iterable[str] = ()) -> Observation:
-        """One control step with the given keys of `MOVES` held down."""
+        """Takes one control step with the given keys of `MOVES` held down."""
         pose = self.obs["robot_obs"][TCP_POSE]
         for key in held:
             axis, direction = MOVES[key]
@@ -147,10 +150,11 @@ class Session:
         return self.obs
 
     def _keep(self, output: Path) -> None:
+        """Writes the recorded frames as one demonstration: of `--task` if it is fulfilled, else of the latest task."""
         asked = self.config.task
         task = asked if asked in self.fulfilled else max(self.fulfilled, key=lambda name: self.fulfilled[name])
         assert task is not None
-        folder = output / ".playing" / f"{len(self.kept):06d}"
+        folder = output / STAGING / f"{len(self.kept):06d}"
         with FrameWriter(folder, self.desk.scene) as writer:
             for row in self._rows:
                 writer.add(row)
@@ -159,7 +163,7 @@ class Session:
         self.kept.append((folder, unit, [self._commands[task][0]]))
 
     def finish(self) -> None:
-        """Publishes the demonstrations kept as OUTPUT_DIR/training; to be called however the session ended."""
+        """Publishes the kept demonstrations as OUTPUT_DIR/training; to be called however the session ended."""
         output = self.config.output_dir
         if output is None:
             return
@@ -167,10 +171,10 @@ class Session:
             details = {key: str(value) for key, value in asdict(self.config).items()} | {"control_hz": CONTROL_HZ}
             publish_split(output / "training", self.kept, 0, details, {})
             print(f"{len(self.kept)} demonstrations in {output}")
-        shutil.rmtree(output / ".playing", ignore_errors=True)
+        shutil.rmtree(output / STAGING, ignore_errors=True)
 
     def picture(self) -> np.ndarray:
-        """What the player sees, (600, 900, 3) uint8: both cameras, verdicts and keys."""
+        """What the person sees, (600, 900, 3) uint8: both cameras, verdicts and keys."""
         canvas = Image.new("RGB", (SIZE * 3 // 2, SIZE), (24, 26, 30))
         canvas.paste(Image.fromarray(self.desk.render("static", SIZE)), (0, 0))
         canvas.paste(Image.fromarray(self.desk.render("gripper", SIZE // 2)), (SIZE, 0))
@@ -197,10 +201,10 @@ def _font(size: int) -> Any:
 
 
 def parse_keys(text: str) -> Iterator[tuple[str, int]]:
-    """`'d10 space wait5'` as (key, steps).
+    """Reads `'d10 space wait5'` as pairs of key and steps.
 
     Raises:
-        DeskError: A word that is no key.
+        DeskError: A word is not a key.
     """
     for word in text.split():
         match = re.fullmatch(r"([a-z]+?)(\d*)", word)
@@ -213,7 +217,7 @@ def parse_keys(text: str) -> Iterator[tuple[str, int]]:
 
 
 class _Video:
-    """An mp4 that grows with each frame and appears when it is complete."""
+    """An mp4 that is written frame by frame and appears when it is complete."""
 
     def __init__(self, path: Path):
         import av
@@ -241,8 +245,8 @@ class _Video:
             self._partial.unlink(missing_ok=True)
 
 
-def play_keys(session: Session, keys: str, video: _Video | None) -> None:
-    """Presses the given keys one after the other."""
+def press_keys(session: Session, keys: str, video: _Video | None) -> None:
+    """Presses the given keys one after the other, without a window."""
     for key, steps in tqdm(list(parse_keys(keys)), desc="playing", unit="key"):
         if key in ("space", "enter", "backspace"):
             session.press(key)
@@ -253,8 +257,8 @@ def play_keys(session: Session, keys: str, video: _Video | None) -> None:
                 video.add(session.picture())
 
 
-def play_window(session: Session, pygame: Any, video: _Video | None) -> None:
-    """Drives by keyboard until ESC or the window's closing."""
+def drive_in_window(session: Session, pygame: Any, video: _Video | None) -> None:
+    """Drives by keyboard until ESC is pressed or the window is closed."""
     window = pygame.display.set_mode((SIZE * 3 // 2, SIZE))
     pygame.display.set_caption(f"CALVIN desk, scene {session.desk.scene.name}")
     pressed = {pygame.K_SPACE: "space", pygame.K_RETURN: "enter", pygame.K_BACKSPACE: "backspace"}
@@ -276,7 +280,7 @@ def play_window(session: Session, pygame: Any, video: _Video | None) -> None:
 
 
 def open_window() -> Any | None:
-    """pygame with a display, or None (and a sentence why) when there is none."""
+    """The module pygame if it finds a display; else None, and the reason is printed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import pygame
@@ -295,8 +299,8 @@ def open_window() -> Any | None:
     return pygame
 
 
-def play(config: PlayConfig) -> Session:
-    """Runs the command; returns the session as it ended.
+def teleoperate(config: TeleopConfig) -> Session:
+    """Runs a session to its end and returns it.
 
     Raises:
         DeskError: An option cannot be carried out.
@@ -308,15 +312,15 @@ def play(config: PlayConfig) -> Session:
         path = Path("play.mp4")
     with Desk(config.scene, config.assets, renderer=config.renderer) as desk:
         session = Session(config, desk)
-        if config.output_dir is not None:  # of a session that was killed
-            shutil.rmtree(config.output_dir / ".playing", ignore_errors=True)
+        if config.output_dir is not None:  # left by a session that was killed
+            shutil.rmtree(config.output_dir / STAGING, ignore_errors=True)
         recorder: AbstractContextManager[_Video | None] = _Video(path) if path else nullcontext()
         try:
             with recorder as video:
                 if pygame is None:
-                    play_keys(session, config.keys or DEMONSTRATION, video)
+                    press_keys(session, config.keys or DEMONSTRATION, video)
                 else:
-                    play_window(session, pygame, video)
+                    drive_in_window(session, pygame, video)
                     pygame.quit()
         finally:
             session.finish()
@@ -325,9 +329,9 @@ def play(config: PlayConfig) -> Session:
 
 
 @draccus.wrap()
-def run(config: PlayConfig) -> None:
-    """Plays."""
-    play(config)
+def run(config: TeleopConfig) -> None:
+    """Runs a session."""
+    teleoperate(config)
 
 
 def main() -> int:

@@ -5,18 +5,20 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 import yaml
 
 import lerobot_lansar.demos.record as record_module
-from lerobot_lansar.calvin import relative_action
-from lerobot_lansar.demos.record import SPLITS, RecordConfig, place_of_unit, record
+from lerobot_lansar.calvin import DRAWER, relative_action
+from lerobot_lansar.demos.record import RecordConfig, record
+from lerobot_lansar.demos.record_config import SPLITS, group_by_scene
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, DeskError
 from lerobot_lansar.desk.sentences import COMMANDS
-from lerobot_lansar.jobs.executors import SlurmConfig, WorkerDied
+from lerobot_lansar.jobs.work import SlurmConfig, WorkerDied
 
 
 def options(output_dir, **changes):
@@ -107,8 +109,8 @@ def test_every_scene_gets_every_task(tmp_path):
     config = RecordConfig(**{**vars(config), "validation_episodes": None})
     assert config.validation_episodes == 6
     training, validation = config.counts()
-    places = [place_of_unit(config, index) for index in range(training + validation)]
-    found = {split: [(p.scene, p.in_scene % 2) for p in places if p.split == split] for split in SPLITS}
+    slots = [config.slot(index) for index in range(training + validation)]
+    found = {split: [(s.scene, s.in_scene % 2) for s in slots if s.split == split] for split in SPLITS}
     assert {pair: found["training"].count(pair) for pair in found["training"]} == {
         (scene, task): 2 for scene in "ABC" for task in (0, 1)
     }
@@ -134,7 +136,7 @@ def test_demonstrations_on_the_original_desk_look_like_it(original_assets, tmp_p
         shown = list(frames(made[assets] / "training").values())
         assert shown[0]["rgb_static"].shape == (200, 200, 3)
         assert shown[0]["rgb_gripper"].shape == (84, 84, 3)
-        drawer = [frame["scene_obs"][1] for frame in shown]
+        drawer = [frame["scene_obs"][DRAWER] for frame in shown]
         assert drawer[-1] - drawer[0] > 0.12
     first = [next(iter(frames(folder / "training").values())) for folder in made.values()]
     assert np.abs(first[0]["rgb_static"].astype(int) - first[1]["rgb_static"]).mean() > 10
@@ -173,17 +175,14 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
     first_file(target / ".recording", "0*.json")
     os.killpg(process.pid, signal.SIGSTOP)
     assert 1 <= len(list((target / ".recording").glob("0*.json"))) < 6
-    with pytest.raises(DeskError, match="another process is recording"):
+    with pytest.raises(ValueError, match="another process is writing"):
         record(options(target))
     process.kill()
     process.wait()
     os.killpg(process.pid, signal.SIGCONT)
-    deadline = time.time() + 120
-    while _alive(process.pid) and time.time() < deadline:  # the workers notice and end
-        time.sleep(0.05)
-    assert not _alive(process.pid)
+    assert is_gone(process.pid)  # the workers notice that their parent is gone
     assert not (target / "training").exists()
-    with pytest.raises(DeskError, match="begun with other options"):
+    with pytest.raises(ValueError, match="begun with other options"):
         record(options(target, seed=4))
     before = {f.name: f.stat().st_mtime_ns for f in (target / ".recording").glob("0*.json")}
     assert before
@@ -194,12 +193,33 @@ def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
         record(options(target))
 
 
-def _alive(group):
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
+def is_gone(group, seconds=60):
+    """Whether all processes of a group end, by themselves and in time."""
+    deadline = time.time() + seconds
+    while time.time() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_an_interrupted_recording_ends_its_workers_and_goes_on(recording, tmp_path):
+    target = tmp_path / "desk"
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # the tests may run where Ctrl-C is ignored
+    process = start(target, stderr=subprocess.PIPE, start_new_session=True, preexec_fn=heed)
+    first_file(target / ".recording", "0*.json")
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors.endswith("lansar-record: interrupted; the same command goes on where it stopped\n")
+    assert "Traceback" not in errors
+    assert is_gone(process.pid)
+    assert not (target / "training").exists()
+    record(options(target))
+    for split in ("training", "validation"):
+        assert same(frames(target / split), frames(recording / split))
 
 
 def test_leftovers_of_an_unknown_recording_are_not_adopted(recording, tmp_path):
@@ -214,8 +234,8 @@ def test_leftovers_of_an_unknown_recording_are_not_adopted(recording, tmp_path):
 def test_a_killed_worker_ends_the_run_and_the_next_one_goes_on(recording, tmp_path):
     target = tmp_path / "desk"
     process = start(target, stderr=subprocess.PIPE)
-    partial = first_file(target / ".recording", "0*-*.partial")  # the worker's first of two or four
-    os.kill(int(partial.stem.split("-")[-1]), signal.SIGKILL)
+    unfinished = first_file(target / ".recording", "0*-*.partial")  # its name ends with the worker's process id
+    os.kill(int(unfinished.stem.split("-")[-1]), signal.SIGKILL)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 2
     assert "a worker process was killed" in errors
@@ -245,7 +265,7 @@ def test_a_split_that_is_there_already_is_never_replaced(tmp_path):
     assert (mine / "precious").exists()
 
 
-def test_a_publication_that_was_cut_short_is_repeated(recording, tmp_path, monkeypatch):
+def test_a_publication_that_failed_is_repeated(recording, tmp_path, monkeypatch):
     target = tmp_path / "desk"
     publish = record_module.publish_split
 
@@ -285,7 +305,7 @@ def test_a_refused_submission_leaves_no_mark_of_jobs_under_way(tmp_path, monkeyp
         raise subprocess.CalledProcessError(1, ["sbatch"])
 
     monkeypatch.setattr(record_module, "run_shards", refused)
-    for _ in range(2):  # again, and not "were submitted already"
+    for _ in range(2):  # the second time too, and not "were submitted already"
         with pytest.raises(subprocess.CalledProcessError):
             record(options(tmp_path / "desk", executor="slurm", slurm=SlurmConfig(partition="cpu")))
 
@@ -318,7 +338,12 @@ def test_users_sentences_are_used(tmp_path):
     assert language["language"]["ann"] == ["light up"]
 
 
-def test_scenes_share_a_recording_and_follow_each_other(tmp_path):
+def test_units_are_divided_evenly_among_scenes_and_grouped_by_scene():
+    assert group_by_scene(["A", "B", "C"], 7) == ["A", "A", "A", "B", "B", "C", "C"]
+    assert group_by_scene(["A", "B", "C"], 1) == ["A"]
+
+
+def test_frames_of_a_recording_are_grouped_by_scene(tmp_path):
     folder = record(options(tmp_path / "desk", scene=["A", "C"], tasks=["turn_on_led"], episodes=3)) / "training"
     scenes = np.load(folder / "scene_info.npy", allow_pickle=True).item()
     bounds = np.load(folder / "ep_start_end_ids.npy")

@@ -6,18 +6,18 @@ import pytest
 
 from dataset_convert.calvin import CalvinSplit
 from lerobot_lansar.calvin import relative_action
-from lerobot_lansar.demos import play
+from lerobot_lansar.demos import teleop
 from lerobot_lansar.desk import Desk, DeskError, SimulationError
 
 
 def test_keys_press_the_button_and_the_video_shows_the_verdict(tmp_path, capsys):
     video = tmp_path / "seen.mp4"
-    session = play.play(play.PlayConfig(keys=play.DEMONSTRATION, video=video))
+    session = teleop.teleoperate(teleop.TeleopConfig(keys=teleop.DEMONSTRATION, video=video))
     assert set(session.fulfilled) == {"turn_on_led"}
     assert "fulfilled: turn_on_led" in capsys.readouterr().out
     with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    steps = sum(steps for _, steps in play.parse_keys(play.DEMONSTRATION))
+    steps = sum(steps for _, steps in teleop.parse_keys(teleop.DEMONSTRATION))
     assert len(frames) == steps
     assert frames[0].shape == (600, 900, 3)
     verdict = np.array([110, 230, 120])
@@ -28,12 +28,12 @@ def test_keys_press_the_button_and_the_video_shows_the_verdict(tmp_path, capsys)
 
 def test_enter_keeps_demonstrations_that_fulfil_a_task(tmp_path):
     press = "a8 w6 f7 wait4 r4"
-    config = play.PlayConfig(
+    config = teleop.TeleopConfig(
         keys=f"wait enter {press} enter enter wait5 enter",
         output_dir=tmp_path / "mine",
         video=tmp_path / "v.mp4",
     )
-    session = play.play(config)
+    session = teleop.teleoperate(config)
     assert [window[2] for _, unit, _ in session.kept for window in unit.windows] == ["turn_on_led"]
     split = CalvinSplit(tmp_path / "mine", "training")
     (window,) = split.windows
@@ -48,33 +48,33 @@ def test_enter_keeps_demonstrations_that_fulfil_a_task(tmp_path):
     assert read["scene_obs"][-1, 5] == 1
     assert not (tmp_path / "mine" / ".playing").exists()
     with pytest.raises(DeskError, match="already holds a recording"):
-        play.play(config)
+        teleop.teleoperate(config)
 
 
 def test_a_task_that_was_undone_is_not_kept(tmp_path):
-    config = play.PlayConfig(
+    config = teleop.TeleopConfig(
         keys="enter a8 w6 f7 wait4 r4 f5 wait5 r4 enter",
         output_dir=tmp_path / "mine",
         video=tmp_path / "v.mp4",
     )
-    session = play.play(config)
+    session = teleop.teleoperate(config)
     assert not session.fulfilled
     assert not session.kept
     assert not (tmp_path / "mine" / "training").exists()
 
 
-def test_what_was_kept_survives_a_session_that_breaks_off(tmp_path, monkeypatch):
-    begin = play.Session.begin
+def test_what_was_kept_survives_a_session_that_fails(tmp_path, monkeypatch):
+    begin = teleop.Session.begin
 
-    def breaks_off(session):
+    def fails(session):
         if session.kept:
             raise SimulationError("diverged")
         begin(session)
 
-    monkeypatch.setattr(play.Session, "begin", breaks_off)
+    monkeypatch.setattr(teleop.Session, "begin", fails)
     with pytest.raises(SimulationError):
-        play.play(
-            play.PlayConfig(
+        teleop.teleoperate(
+            teleop.TeleopConfig(
                 keys="enter a8 w6 f7 wait4 r4 enter backspace wait",
                 output_dir=tmp_path / "mine",
                 video=tmp_path / "v.mp4",
@@ -86,7 +86,7 @@ def test_what_was_kept_survives_a_session_that_breaks_off(tmp_path, monkeypatch)
 
 def test_the_window_takes_keys(monkeypatch, tmp_path):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    pygame = play.open_window()
+    pygame = teleop.open_window()
     assert pygame is not None
     held = {pygame.K_d: 12}
     presses = [pygame.K_SPACE]
@@ -107,11 +107,11 @@ def test_the_window_takes_keys(monkeypatch, tmp_path):
 
     monkeypatch.setattr(pygame.key, "get_pressed", Held)
     monkeypatch.setattr(pygame.event, "get", events)
-    monkeypatch.setattr(play, "open_window", lambda: pygame)
-    config = play.PlayConfig(task="open_drawer", seed=1, video=tmp_path / "v.mp4")
+    monkeypatch.setattr(teleop, "open_window", lambda: pygame)
+    config = teleop.TeleopConfig(task="open_drawer", seed=1, video=tmp_path / "v.mp4")
     with Desk("D") as desk:
-        start = play.Session(config, desk).obs
-    session = play.play(config)
+        start = teleop.Session(config, desk).obs
+    session = teleop.teleoperate(config)
     assert session.steps == 14
     assert session.obs["robot_obs"][0] - start["robot_obs"][0] > 0.1
     assert session.obs["robot_obs"][14] == -start["robot_obs"][14]
@@ -120,10 +120,10 @@ def test_the_window_takes_keys(monkeypatch, tmp_path):
 def test_without_a_display_keys_are_played(monkeypatch, tmp_path, capsys):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(play.sys, "platform", "linux")
+    monkeypatch.setattr(teleop.sys, "platform", "linux")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(play, "DEMONSTRATION", "wait2")
-    play.play(play.PlayConfig())
+    monkeypatch.setattr(teleop, "DEMONSTRATION", "wait2")
+    teleop.teleoperate(teleop.TeleopConfig())
     assert (tmp_path / "play.mp4").is_file()
     assert "no window without a display" in capsys.readouterr().err
 
@@ -137,4 +137,4 @@ def test_without_a_display_keys_are_played(monkeypatch, tmp_path, capsys):
 )
 def test_errors_name_the_option(options, message):
     with pytest.raises(DeskError, match=message):
-        play.play(play.PlayConfig(**options))
+        teleop.teleoperate(teleop.TeleopConfig(**options))

@@ -1,9 +1,10 @@
-"""Drawer, door, switch and button: what a hand does to the desk's parts."""
+"""Moving the desk's parts: drawer, door, switch and button."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
+from ...calvin import SWITCH
 from ...desk.scenes import BUTTON_TRAVEL, BUTTON_Y
 from ..moves import CLOSED, FORWARD, TRIES, Skill, View, Waypoint, travel
 
@@ -12,7 +13,7 @@ HANDLE_Z = 0.365
 
 
 def open_drawer(view: View) -> Iterator[Waypoint]:
-    """Reach behind the handle's bar from above and pull; pull again if the drawer stopped short."""
+    """Reach behind the handle's bar from above and pull; pull again if the drawer did not come far enough."""
     x = view.scene.drawer_x + view.scatter(0.06)
     for _ in range(TRIES):
         gap = -0.211 - view.drawer
@@ -34,7 +35,7 @@ def close_drawer(view: View) -> Iterator[Waypoint]:
 
 
 def press_button(view: View) -> Iterator[Waypoint]:
-    """Press the LED's button from above; let go and press again if the light did not change."""
+    """Press the LED's button from above; release it and press again if the light did not change."""
     for _ in range(TRIES):
         x, y = view.scene.button_x + view.scatter(0.012), BUTTON_Y + view.scatter(0.012)
         yield from travel(view, (x, y, 0.56), view.style.idle_gripper)
@@ -45,10 +46,10 @@ def press_button(view: View) -> Iterator[Waypoint]:
 
 def slide(direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
-        """Go beside the door's handle and push it along."""
+        """Go beside the door's handle and push it along the cabinet."""
         for _ in range(TRIES):
-            # the handle is 0.042 m wide around this x and moves to -x as the joint grows
-            handle = view.scene.slide_x + 0.14 - view.scene_obs[0]
+            # the handle is 0.042 m wide, centred at this x
+            handle = view.scene.slide_x + 0.14 - view.slide
             beside = handle - direction * (0.021 + 0.05 + abs(view.scatter(0.015)))
             end = view.scene.slide_x + 0.14 - (view.scene.slide_travel if direction < 0 else 0.0)
             z = 0.53 + view.scatter(0.006)
@@ -62,13 +63,13 @@ def slide(direction: float) -> Skill:
 
 
 def _lever(view: View) -> np.ndarray:
-    """Middle of the switch's bar, (3,) m: it slides up the cabinet's front, which leans back by 30 degrees."""
-    way = view.scene_obs[3]
+    """Centre of the switch's bar, (3,) m; the bar slides up the cabinet's front, which leans back by 30 degrees."""
+    way = view.scene_obs[SWITCH]
     return np.array([view.scene.switch_x, 0.019 + 0.5 * way, 0.528 + 0.866 * way])
 
 
 def _reaching(view: View) -> np.ndarray:
-    """Fingers forward and outward: how the arm reaches the lever, which a hand pointing straight down does not."""
+    """Euler angles (3,) of a hand whose fingers point forward and outward; one pointing down cannot reach the lever."""
     return np.array([np.pi - 0.5 * np.sign(view.scene.switch_x), -0.6, FORWARD])
 
 

@@ -1,0 +1,164 @@
+"""The options of `lansar-record`, and which unit of a recording belongs where."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from ..calvin import CONTROL_HZ
+from ..desk import SCENES, DeskError
+from ..jobs.executors import check_executor
+from ..jobs.work import SlurmConfig
+from .skills import SKILLS
+
+SPLITS = ("training", "validation")
+MODES = ("windows", "play", "chains")
+
+
+def group_by_scene(scenes: Sequence[str], count: int) -> list[str]:
+    """The scene of each of `count` units: divided as evenly as possible, units of one scene next to each other.
+
+    >>> group_by_scene(["A", "B"], 5)
+    ['A', 'A', 'A', 'B', 'B']
+    """
+    return [scenes[index * len(scenes) // count] for index in range(count)]
+
+
+class UnitSlot(NamedTuple):
+    """Where a unit (an episode, or a session of play) belongs in a recording.
+
+    Attributes:
+        split: One of `SPLITS`.
+        number: The unit's number within its split.
+        scene: Letter of the scene that it is recorded in.
+        in_scene: The unit's number among those of its scene and split.
+    """
+
+    split: str
+    number: int
+    scene: str
+    in_scene: int
+
+
+@dataclass
+class RecordConfig:
+    """Records demonstrations into OUTPUT_DIR/training and OUTPUT_DIR/validation, in CALVIN's on-disk format."""
+
+    output_dir: Path
+    # One scene, or several among which the recording is divided evenly: --scene='[A,B,C]'.
+    scene: list[str] | str = "D"
+    # windows: one command from a random start per episode; play: tasks follow each other without a reset, and CALVIN's
+    # windows of at most 64 frames are cut from that; chains: play whose windows are whole subtasks.
+    mode: str = "windows"
+    # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
+    tasks: list[str] = field(default_factory=lambda: list(SKILLS))
+    # Accepted demonstrations in the training split, and in the validation split (a tenth by default, and at least one
+    # of each task in each scene). Windows only.
+    episodes: int = 100
+    validation_episodes: int | None = None
+    # Hours of play or chains in the training split, and in the validation split (a tenth by default).
+    hours: float = 1.0
+    validation_hours: float | None = None
+    # Length of a session of play or chains; sessions are divided among the workers.
+    session_minutes: float = 2.0
+    seed: int = 0
+    # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
+    cameras: list[str] = field(default_factory=lambda: ["static", "gripper"])
+    # Disturbance of executed actions, in relative action units (the recorded actions are the intended ones).
+    noise: float = 0.2
+    # How much speed, approach, contact points and pauses differ between episodes: 0 (not at all) to 1.
+    variety: float = 1.0
+    # The `data` folder of a calvin_env checkout; the built-in desk by default.
+    assets: str | None = None
+    # What draws the pictures: fast, fast_gl (the look of CALVIN's public data), tiny or egl.
+    renderer: str = "fast"
+    # YAML of sentences by task for each split; our own by default.
+    annotations: str | None = None
+    validation_annotations: str | None = None
+    # Where the work runs: local (processes), slurm or ray (pip install 'lerobot_policy_lansar[ray]').
+    executor: str = "local"
+    workers: int = 1
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+
+    def __post_init__(self) -> None:
+        if self.validation_episodes is None:
+            one_of_each = len(set(self.tasks)) * len(self.scenes)
+            self.validation_episodes = max(one_of_each, round(self.episodes / 10))
+        if self.validation_hours is None:
+            self.validation_hours = self.hours / 10
+
+    def check(self) -> None:
+        """Raises ValueError for options that cannot be carried out."""
+        for task in self.tasks:
+            if task not in SKILLS:
+                raise DeskError(f"--tasks: there is no task {task!r}; choose among: {', '.join(SKILLS)}")
+        if not self.tasks:
+            raise DeskError("--tasks must name at least one task")
+        for scene in self.scenes:
+            if scene not in SCENES:
+                raise DeskError(f"--scene: {scene!r} is none of {', '.join(SCENES)}")
+        if not self.scenes or len(set(self.scenes)) != len(self.scenes):
+            raise DeskError(f"--scene must name one scene, or different ones as '[A,B]', got {self.scene}")
+        if self.mode not in MODES:
+            raise DeskError(f"--mode is one of {', '.join(MODES)}, got {self.mode!r}")
+        check_executor(self.executor, self.slurm)
+        if not 0 <= self.variety <= 1:
+            raise DeskError(f"--variety lies between 0 and 1, got {self.variety}")
+        if not 0 <= self.noise <= 0.5:
+            raise DeskError(f"--noise lies between 0 and 0.5, got {self.noise}")
+        if self.seed < 0:
+            raise DeskError(f"--seed must be 0 or more, got {self.seed}")
+        for name in ("episodes", "validation_episodes", "workers"):
+            if getattr(self, name) < 1:
+                raise DeskError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        for name, minutes in (("hours", 60), ("validation_hours", 60), ("session_minutes", 1)):
+            if not 0.1 <= getattr(self, name) * minutes <= 1e6:
+                raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
+        if self.mode != "windows" and self.tasks != list(SKILLS):
+            raise DeskError(f"--tasks goes with --mode=windows; --mode={self.mode} carries out whatever is feasible")
+
+    @property
+    def scenes(self) -> list[str]:
+        """The scenes by letter."""
+        return [self.scene] if isinstance(self.scene, str) else self.scene
+
+    def request(self) -> dict[str, object]:
+        """The options that decide what the recorded data are: all but where they go and where the work runs."""
+        without = {"output_dir", "workers", "executor", "slurm"}
+        without |= (
+            {"hours", "validation_hours", "session_minutes"}
+            if self.mode == "windows"
+            else {"tasks", "episodes", "validation_episodes"}
+        )
+        return {k: v for k, v in asdict(self).items() if k not in without}
+
+    def counts(self) -> tuple[int, int]:
+        """How many units the training and the validation split have: episodes, or sessions of play."""
+        if self.mode == "windows":
+            assert self.validation_episodes is not None
+            return self.episodes, self.validation_episodes
+        training, validation = (len(self.session_frames(split)) for split in SPLITS)
+        return training, validation
+
+    def session_frames(self, split: str) -> list[int]:
+        """Frames in each session of play; the last session holds the remainder."""
+        hours = self.hours if split == "training" else self.validation_hours
+        assert hours is not None
+        left, each = (round(minutes * 60 * CONTROL_HZ) for minutes in (hours * 60, self.session_minutes))
+        return [min(each, left - start) for start in range(0, left, each)]
+
+    def shard_size(self) -> int:
+        """Units that one shard of work records; decided by the request alone."""
+        return max(4, sum(self.counts()) // 500) if self.mode == "windows" else 1
+
+    def annotations_of(self, split: str) -> str | None:
+        """The user's file of sentences for a split, if any."""
+        return self.annotations if split == "training" else self.validation_annotations
+
+    def slot(self, index: int) -> UnitSlot:
+        """Where the `index`-th of all units belongs. Units are grouped by scene; tasks cycle within each scene."""
+        training, validation = self.counts()
+        split, count = ("training", training) if index < training else ("validation", validation)
+        number = index if index < training else index - training
+        scenes = group_by_scene(self.scenes, count)
+        return UnitSlot(split, number, scenes[number], number - scenes.index(scenes[number]))
