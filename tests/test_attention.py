@@ -37,14 +37,14 @@ def checkpoint(tmp_path):
 
 def run(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["lansar-attention", *map(str, arguments)])
-    attention_module.main()
+    return attention_module.main()
 
 
 def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypatch):
     seen = []
     observe = attention_module.observe
     monkeypatch.setattr(attention_module, "observe", lambda config: seen.append(observe(config)) or seen[-1])
-    run(
+    code = run(
         monkeypatch,
         f"--policy.path={checkpoint}",
         "--env.type=calvin",
@@ -55,6 +55,7 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
         "--decoder_steps=[0,10,99]",
         f"--output_dir={tmp_path / 'out'}",
     )
+    assert code == 0
     (attention,) = seen
     assert attention.tokens == ["CLS", "X", "B_red", "B_blue", "B_pink", "S", "C"]
     assert attention.context.shape == (20, 2, 2, 7, 7)
@@ -62,9 +63,10 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
     sums = attention.context.sum(-1)
     np.testing.assert_allclose(sums[:, 0], 1, atol=1e-5)
     np.testing.assert_allclose(sums[:, 1, :, 0], 1, atol=1e-5)
-    assert np.isnan(sums[:, 1, :, 1:]).all()  # of the last layer CLS alone is read
+    assert np.isnan(sums[:, 1, :, 1:]).all()  # only CLS is read in the last layer
     np.testing.assert_allclose(attention.per_modality().sum(1), 7, atol=1e-4)
-    lengths = [step["self"].shape[-1] for step in attention.decoder]  # two tokens a step; half is forgotten at 8
+    # Two tokens per step; a full window of 8 steps drops 4.
+    lengths = [step["self"].shape[-1] for step in attention.decoder]
     assert lengths == [2, 4, 6, 8, 10, 12, 14, 16, *[10, 12, 14, 16] * 3]
     for step in attention.decoder:
         assert step["cross"].shape[:2] == (3, 2)
@@ -77,9 +79,7 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
 
 
 def test_other_policies_are_refused(monkeypatch, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", "--env.type=calvin")
-    assert stopped.value.code == 2
-    assert (
-        "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act" in capsys.readouterr().err
-    )
+    code = run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", "--env.type=calvin")
+    assert code == 2
+    message = "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act"
+    assert message in capsys.readouterr().err

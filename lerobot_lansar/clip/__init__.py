@@ -1,5 +1,5 @@
-"""CLIP: what turns pictures and commands into embeddings, and where a dataset keeps those of its pictures.
+"""CLIP: embeddings of pictures and commands, and where a dataset stores those of its pictures.
 
-model   open_clip's towers behind one small class
+model   open_clip's image and text encoders behind one small class
 store   embeddings in a folder beside a dataset's frames; needs neither torch nor LeRobot
 """

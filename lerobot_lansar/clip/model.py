@@ -1,8 +1,8 @@
 """CLIP through open_clip: pictures and commands in, embeddings out (Eq 3.2-3.4).
 
-Embeddings are CLIP's own outputs, not divided by their norm. Converting a dataset and running the policy go
-through this one class, so a stored and a freshly computed embedding of the same picture agree (on a GPU
-as closely as TF32 products do, which LeRobot's commands allow).
+Embeddings are CLIP's own outputs, not divided by their norm. Conversion and policy both use this class, so the stored
+and the freshly computed embedding of a picture agree (on a GPU to the precision of TF32, which LeRobot's commands
+allow).
 """
 
 import contextlib
@@ -20,26 +20,22 @@ import torch.nn.functional as F
 from torch import Tensor
 
 CLIP_MODELS = Path(__file__).parent / "clip_models"
-"""Model configurations in open_clip's format that come with this package; trained weights belong here too."""
+"""Model configurations in open_clip's format that come with this package; the place for trained weights too."""
 
 
 @dataclass
 class ClipConfig:
-    """Which CLIP.
+    """Which CLIP."""
 
-    Attributes:
-        model: An open_clip model name ("ViT-B-32") or one that comes with this package ("lansar-tiny").
-        pretrained: An open_clip tag ("openai"), a local weights file, or "" for random weights from a fixed
-            seed.
-    """
-
+    # An open_clip model name (ViT-B-32), or one that comes with this package (lansar-tiny).
     model: str = "ViT-B-32"
+    # An open_clip tag (openai), a local weights file, or nothing for random weights from a fixed seed.
     pretrained: str = "openai"
 
 
 @functools.cache
 def _open_clip() -> Any:
-    """open_clip, knowing our models too. Imported late: it is slow, and not always needed."""
+    """open_clip with our models added. Imported late: it is slow, and not always needed."""
     import open_clip
 
     open_clip.add_model_config(CLIP_MODELS)
@@ -76,16 +72,16 @@ def embedding_size(model: str) -> int:
 
 
 def weights_are_public(config: ClipConfig) -> bool:
-    """True for an open_clip tag: such weights can be fetched by name, no checkpoint need carry them."""
+    """True for an open_clip tag: such weights can be downloaded by name, so checkpoints need not contain them."""
     return bool(config.pretrained and _open_clip().get_pretrained_cfg(config.model, config.pretrained))
 
 
 class Clip:
-    """Both towers of one CLIP, frozen, in float32.
+    """The image and the text encoder of one CLIP, frozen, in float32.
 
     Args:
         config: Model and weights.
-        device: Where the towers live and compute.
+        device: Where the encoders run.
         weights: A state dict to use instead of `config.pretrained` (from a checkpoint).
 
     Attributes:
@@ -108,15 +104,14 @@ class Clip:
                 f"--policy.clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of "
                 f"{config.model} ({tags})."
             )
-        # Without weights of its own choice open_clip warns of a random model; here that is meant, or about to
-        # be replaced by a checkpoint's weights.
+        # open_clip warns about random weights; here that is intended, or a checkpoint follows.
         with torch.random.fork_rng(devices=[]), _quiet_logging():
-            torch.manual_seed(0)  # the same random weights every time; the caller's generator is left alone
+            torch.manual_seed(0)  # the same random weights every time, without touching the caller's generator
             model = open_clip.create_model(
                 config.model,
                 pretrained=config.pretrained if weights is None and config.pretrained else None,
-                # Some tags (ViT-B-32/openai) were trained with another activation than their model's file
-                # says; open_clip only warns, and the embeddings would be wrong.
+                # Some tags (ViT-B-32/openai) were trained with another activation than their model's file says;
+                # open_clip only warns, and the embeddings would be wrong.
                 force_quick_gelu=bool(tag.get("quick_gelu", False)),
             )
         if weights is not None:
@@ -132,7 +127,7 @@ class Clip:
 
     @functools.cached_property
     def weights_sha256(self) -> str:
-        """SHA-256 over names and values of all weights: tells which CLIP made an embedding."""
+        """SHA-256 over names and values of all weights: identifies the CLIP that made an embedding."""
         digest = hashlib.sha256()
         for name, value in sorted(self.model.state_dict().items()):
             digest.update(name.encode())
@@ -147,7 +142,7 @@ class Clip:
 
     @torch.no_grad()
     def encode_images(self, images: Tensor | np.ndarray) -> Tensor:
-        """Pictures to embeddings.
+        """Embeds pictures.
 
         Args:
             images: uint8 (B, H, W, 3), or float (B, 3, H, W) in [0, 1].
@@ -173,10 +168,10 @@ class Clip:
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Tensor:
-        """Commands to embeddings, (B, D) float32 on this CLIP's device."""
+        """Embeds commands: (B, D) float32 on this CLIP's device."""
         with self._full_precision():
             return self.model.encode_text(self.tokenizer(texts).to(self.device))
 
     def _full_precision(self) -> torch.autocast:
-        """An embedding is the same inside and outside a mixed-precision run."""
+        """Makes embeddings the same inside and outside a mixed-precision run."""
         return torch.autocast(self.device.type, enabled=False)

@@ -17,12 +17,12 @@ from ..calvin import CAMERAS
 from ..jobs.staging import write_atomically
 
 IMAGE_FEATURES = {camera: f"observation.images.{camera}" for camera in CAMERAS}
-"""Camera to LeRobot's feature of its pictures."""
+"""Camera to LeRobot's feature with its pictures."""
 
 _DESCRIPTION = "clip.json"
+_STATE = "state.json"  # how far an unfinished pass got
 PARTIAL = Path(".cache") / "huggingface" / "lansar_clip"
-"""Where a pass works until it is done: the hub's client never uploads what lies in this folder of a dataset."""
-_STATE = "state.json"  # how far a pass came
+"""A dataset's folder for embeddings that are not complete yet; the hub's client never uploads it."""
 
 
 def clip_dir(root: Path) -> Path:
@@ -45,9 +45,8 @@ def data_files(root: Path) -> list[Path]:
 def dataset_fingerprint(root: Path) -> str:
     """Identifies the contents of a dataset's frame tables, the same wherever the dataset lies.
 
-    Of each parquet file it reads name, size and the last 64 KiB: there parquet keeps row counts, the sizes of all
-    column chunks and their smallest and largest values. Rewritten frames therefore show, unless they keep all of these
-    to the byte.
+    It reads name, size and the last 64 KiB of each parquet file, where parquet keeps row counts, the sizes of all
+    column chunks and their minima and maxima. It misses only rewritten frames that leave all of these unchanged.
 
     Args:
         root: The LeRobotDataset's folder.
@@ -66,13 +65,13 @@ def dataset_fingerprint(root: Path) -> str:
 
 
 def sha256(path: Path) -> str:
-    """A file's hash, 64 hexadecimal digits."""
+    """SHA-256 of a file, 64 hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_description(root: Path) -> dict[str, Any] | None:
-    """What `clip.json` says; None without one."""
+    """The contents of `clip.json`; None if there is none."""
     file = clip_dir(root) / _DESCRIPTION
     return json.loads(file.read_text()) if file.is_file() else None
 
@@ -90,7 +89,7 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
 
     Raises:
         FileNotFoundError: The dataset has none.
-        ValueError: They belong to other frames than the dataset's.
+        ValueError: They were made for other frames than the dataset has.
     """
     folder = clip_dir(root)
     needed = [_DESCRIPTION, *(f"{feature}.npy" for feature in IMAGE_FEATURES.values())]
@@ -98,8 +97,8 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
     if missing:
         raise FileNotFoundError(
             f"{folder} lacks {', '.join(missing)}: the dataset has no CLIP embeddings of its pictures. "
-            "Convert it with `lansar-convert --embed=true`, or train without: --policy.use_images=false. "
-            "(With --dataset.episodes LeRobot fetches only a part from the hub: download the whole dataset.)"
+            "Convert it with `lansar-convert --embed=true`, or train without pictures: --policy.use_images=false. "
+            "(With --dataset.episodes LeRobot downloads only a part from the hub: download the whole dataset.)"
         )
     info = json.loads((folder / _DESCRIPTION).read_text())
     arrays = {camera: np.load(folder / f"{feature}.npy", mmap_mode="r") for camera, feature in IMAGE_FEATURES.items()}
@@ -116,18 +115,18 @@ def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray
 
 
 class EmbeddingWriter:
-    """Writes a dataset's embeddings; the folder appears complete, and an interrupted pass goes on where it was saved.
+    """Writes a dataset's embeddings. Their folder appears only when complete; an interrupted pass can be resumed.
 
     Args:
         root: The dataset's folder.
-        description: What `clip.json` will say, but for `files`.
+        description: The contents of `clip.json` without `files`.
 
     Attributes:
-        finished: The folder is there already, with these embeddings.
-        done: How many pictures an earlier pass saved.
+        finished: The folder exists already, with these embeddings.
+        done: How many pictures per camera are embedded; more than 0 at the start of a resumed pass.
 
     Raises:
-        ValueError: There are embeddings of another CLIP, or of other frames.
+        ValueError: The folder exists with embeddings of another CLIP or of other frames.
     """
 
     def __init__(self, root: Path, description: dict[str, Any]):
@@ -137,7 +136,7 @@ class EmbeddingWriter:
         self.finished, self.done = self.folder.exists(), 0
         if self.finished:
             self._check_same()
-            (self.folder / _STATE).unlink(missing_ok=True)  # a pass was killed after its last step but one
+            (self.folder / _STATE).unlink(missing_ok=True)  # left over if `finish` was killed before its last line
             return
         self._begin()
         self._arrays = {
@@ -145,32 +144,32 @@ class EmbeddingWriter:
         }
 
     def add(self, rows: list[np.ndarray], embeddings: dict[str, np.ndarray]) -> None:
-        """Takes the embeddings of n pictures per camera.
+        """Adds the embeddings of the next n pictures of each camera.
 
         Args:
-            rows: For each picture the numbers of the dataset's rows that show it.
+            rows: For each picture, the dataset's rows that show it.
             embeddings: Image feature to (n, D).
         """
-        repeats = [len(of) for of in rows]
+        repeats = [len(picture_rows) for picture_rows in rows]
         for feature, array in self._arrays.items():
             array[np.concatenate(rows)] = np.repeat(embeddings[feature].astype(np.float16), repeats, axis=0)
         self.done += len(rows)
 
     def save(self) -> None:
-        """Whatever happens now, an equal pass goes on from here."""
+        """Saves the progress: a pass with the same description resumes from here."""
         for array in self._arrays.values():
             array.flush()
         state = {"description": self._description, "done": self.done}
         write_atomically(self._partial / _STATE, json.dumps(state))
 
     def finish(self) -> None:
-        """Puts the folder in its place."""
+        """Moves the complete folder to its place."""
         self.save()
         self._arrays.clear()
         files = {f"{feature}.npy": sha256(self._partial / f"{feature}.npy") for feature in IMAGE_FEATURES.values()}
         (self._partial / _DESCRIPTION).write_text(json.dumps({**self._description, "files": files}, indent=2) + "\n")
         self._partial.rename(self.folder)
-        # Last: without its state an unfinished pass would be begun again.
+        # Only now: if the rename fails, the next pass needs this file to resume.
         (self.folder / _STATE).unlink()
 
     def _check_same(self) -> None:
@@ -186,7 +185,7 @@ class EmbeddingWriter:
         print(f"{self.folder} already holds these embeddings", file=sys.stderr)
 
     def _begin(self) -> None:
-        """Goes on with what an earlier pass saved, or begins anew if it was another one."""
+        """Resumes an earlier pass with the same description, or else starts over."""
         state = self._partial / _STATE
         if state.is_file():
             saved = json.loads(state.read_text())

@@ -1,7 +1,17 @@
 """LanSAR as a LeRobot policy: importing this package registers `--policy.type=lansar`.
 
-The processor and scheduler are imported too: LeRobot rebuilds a checkpoint's pipelines and schedule by
-registered name and imports nothing to find them. The model itself is imported by LeRobot when it is built.
+configuration_lansar  LanSARConfig: every option
+modeling_lansar       LanSARPolicy: the loss in training, one action per control step at inference
+network               LanSARNetwork: the neural network alone, tensors in and out
+cache                 the decoder's key-value cache
+scaling               observations and motions to numbers of order one, and back
+processor_lansar      LeRobot pipeline steps: training windows, CLIP embeddings
+windows               which steps of which demonstration a sampled frame stands for
+frames                a dataset's frames as memory-mapped arrays
+scheduler             the learning rate over a run
+
+LeRobot rebuilds a checkpoint's pipelines and scheduler by their registered names, so processor and scheduler are
+imported here. It imports the model itself when it builds one.
 """
 
 from .configuration_lansar import LanSARConfig

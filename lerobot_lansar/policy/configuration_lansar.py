@@ -9,7 +9,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from ..clip.model import ClipConfig, embedding_size
 from .network import NetworkConfig
-from .scaling import STATE_DIM, encoded_sizes
+from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, encoded_sizes
 from .scheduler import LinearWarmupDecaySchedulerConfig
 
 CHOICES = {
@@ -27,95 +27,98 @@ CHOICES = {
 class LanSARConfig(PreTrainedConfig):
     """Every option of LanSAR: network, data, loss, optimizer, inference.
 
-    The thesis to the letter is `configs/thesis/baseline.yaml`. The defaults here are its sizes (Table 4.2) with
-    what docs/RESULTS.md found better at a size that a CPU trains: targets from the commanded action and
-    inference that takes the prediction as it is, blocks as the hand sees them, a context that knows the command,
-    windows that do not all start with the demonstration.
+    The defaults are the thesis' sizes (Table 4.2) with the choices that docs/RESULTS.md found better at a size that a
+    CPU can train: targets from the commanded action, predictions executed without scaling, blocks also seen from the
+    hand, the command in the context, and windows that start anywhere in a demonstration, not only at its start.
+    `configs/thesis/baseline.yaml` follows the thesis to the letter.
 
-    A resumed or fine-tuned run keeps the checkpoint's scaling statistics, which its weights are made for; leave
+    A resumed or fine-tuned run keeps the checkpoint's scaling statistics, because its weights depend on them. Leave
     `target`, `orientation`, `egocentric_blocks` and `clip` as they were trained.
-
-    Attributes:
-        hidden, context_layers, context_heads, decoder_layers, decoder_heads, feedforward, dropout: Table 4.2;
-            8 decoder heads, since the table's 6 do not divide 512.
-        window: Longest history in steps, in training and at inference.
-        mlp_norm: Normalisation in the MLPs. "batch" as in the thesis; "layer" for small batches.
-        use_images: Static and gripper picture (CLIP embeddings) are part of the context.
-        use_spatial_context: Robot, block and scene state are part of the context (the decoder always sees the
-            robot).
-        command_in_context: The command is also a token of the context, and CLS asks with it which of the others matter.
-        command_prepended: The command stands once at the front instead of before every step (Table 5.3).
-        orientation: How euler angles enter the network. "euler" as they are, "sincos" without the +-pi jump
-            (the gripper's roll sits there). Predicted are wrapped differences either way.
-        egocentric_blocks: Blocks also come as seen from the TCP, with finer steps near it, so that the network
-            need not learn to subtract two positions.
-        target: What the motion head learns: "commanded" = the recorded action minus the current pose;
-            "achieved" = the next pose minus the current pose (thesis).
-        window_start: Which windows are trained on, see `windows.py`. "episode" = from the demonstration's
-            start (thesis), "anywhere" = from the sampled frame, "mixed" = half of each.
-        paraphrases: In training a window's command is replaced by a random one among the dataset's sentences for
-            the same CALVIN task (the dataset's column calvin.task).
-        state_noise: In training the robot state (but not the last gripper action) is disturbed by normal noise of this
-            standard deviation, in its own units, m and rad.
-        contrastive_weight: Weight of a contrastive loss between commands and the windows that carry them out; those
-            of the same CALVIN task are not held against each other (the dataset's column calvin.task).
-        dtype: "float32", or "bfloat16" for mixed-precision training on a GPU that has it.
-        smooth_l1_beta: Beta of Eq 4.3, 4.4.
-        learning_rate, weight_decay, warmup_fraction: AdamW and its schedule (Table 4.2).
-        control_mode: What `select_action` returns. "abs": target pose (m, rad); "rel": the difference to the
-            pose in units of (0.02 m, 0.05 rad), clipped to +-1. Must be the env's own (`--env.control_mode`).
-        history_clear_steps: The history is forgotten after this many steps (and whenever the command
-            changes).
-        window_slide: Once the window is full, its oldest steps are forgotten so many at a time. 1 as in the
-            thesis: every position changes at every step, so the whole window is decoded again. Half a window
-            (what 0, the default, stands for) decodes one step most of the time.
-        position_scale_start, position_scale_slope: Predicted position differences are multiplied by
-            start - slope * history / window; the thesis has 3 and 1 (Eq 4.8).
-        yaw_scale: Predicted yaw differences are multiplied by this; 1.5 in the thesis (section 4.3.1).
-        clip: Which CLIP embeds commands and pictures.
     """
 
+    # Hidden size; both numbers of attention heads must divide it.
     hidden: int = 512
+    # Layers of the context encoder.
     context_layers: int = 6
+    # Attention heads of the context encoder.
     context_heads: int = 16
+    # Layers of the decoder.
     decoder_layers: int = 6
+    # Attention heads of the decoder. Table 4.2 has 6, which does not divide 512.
     decoder_heads: int = 8
+    # Width of the feed-forward layers.
     feedforward: int = 2048
+    # Dropout probability, the same everywhere in the network.
     dropout: float = 0.1
+    # Longest history in control steps, in training and at inference.
     window: int = 64
+    # Normalisation in the MLPs: batch (thesis), or layer for small batches.
     mlp_norm: str = "batch"
+    # The context includes the static and the gripper picture, as CLIP embeddings.
     use_images: bool = True
+    # The context includes the state of robot, blocks and scene. The decoder sees the robot's state in any case.
     use_spatial_context: bool = True
+    # The context includes the command, which also decides what its CLS token attends to.
     command_in_context: bool = True
+    # The command stands once at the front of the decoder's sequences instead of before every step (Table 5.3).
     command_prepended: bool = False
 
+    # How Euler angles enter the network: euler (as they are) or sincos (without the jump at +-pi, near which the
+    # gripper's roll stays). Either way the network predicts wrapped differences.
     orientation: str = "sincos"
+    # Block positions are also given relative to the TCP, with finer resolution near it, so that the network need not
+    # learn to subtract positions.
     egocentric_blocks: bool = True
+    # What the motion head learns to predict: commanded (recorded action minus current pose) or achieved (next pose
+    # minus current pose, thesis).
     target: str = "commanded"
+    # Where training windows start: episode (at the demonstration's start, thesis), anywhere (at the sampled frame) or
+    # mixed (half of each).
     window_start: str = "mixed"
+    # In training, each command is replaced by a random sentence for the same CALVIN task. Needs the dataset's column
+    # calvin.task.
     paraphrases: bool = False
+    # In training, normal noise of this standard deviation (in m and rad) is added to the robot state, but not to the
+    # last gripper action.
     state_noise: float = 0.0
+    # Weight of a contrastive loss between commands and the windows that carry them out; windows of the same CALVIN task
+    # are no negatives. Above 0 it needs the dataset's column calvin.task.
     contrastive_weight: float = 0.0
+    # float32, or bfloat16 for mixed-precision training on a GPU that supports it.
     dtype: str = "float32"
 
+    # Beta of the smooth L1 losses (Eq 4.3, 4.4).
     smooth_l1_beta: float = 0.1
+    # Peak learning rate of AdamW.
     learning_rate: float = 4e-4
+    # Weight decay of AdamW.
     weight_decay: float = 0.01
+    # Share of the updates in which the learning rate rises; afterwards it falls to 0.
     warmup_fraction: float = 0.04
 
+    # What select_action returns: abs (TCP pose to go to, in m and rad) or rel (difference to the current pose in units
+    # of 0.02 m and 0.05 rad, clipped to +-1). Must equal --env.control_mode.
     control_mode: str = "abs"
+    # The history is cleared after this many steps, and whenever the command changes.
     history_clear_steps: int = 120
+    # Number of oldest steps dropped when the window is full; 0 means half a window. Dropping steps moves all positions,
+    # so the rest of the window is decoded again: at every step with 1 (thesis), once in 32 steps with half of 64.
     window_slide: int = 0
+    # Predicted position differences are multiplied by position_scale_start - position_scale_slope * history / window;
+    # the thesis has 3 and 1 (Eq 4.8).
     position_scale_start: float = 1.0
+    # See position_scale_start.
     position_scale_slope: float = 0.0
+    # Predicted yaw differences are multiplied by this; the thesis has 1.5 (section 4.3.1).
     yaw_scale: float = 1.0
 
+    # Which CLIP embeds commands and pictures.
     clip: ClipConfig = field(default_factory=ClipConfig)
 
-    # Uploading is asked for, not the default: --policy.push_to_hub=true --policy.repo_id=you/name.
+    # Upload the trained policy; needs --policy.repo_id=you/name.
     push_to_hub: bool = False
-
-    # LanSAR scales with statistics of its own, kept in the checkpoint; LeRobot's normaliser changes nothing.
+    # Leave this as it is: LanSAR scales with its own statistics, kept in the checkpoint, so LeRobot's normaliser must
+    # change nothing.
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -141,19 +144,19 @@ class LanSARConfig(PreTrainedConfig):
                 raise ValueError(f"--policy.{name}={getattr(self, name)} must be 0 or more.")
         if not 0 <= self.window_slide <= self.window:
             raise ValueError(
-                f"--policy.window_slide={self.window_slide} must lie between 1 and --policy.window={self.window}, or "
-                "be 0 for half a window."
+                f"--policy.window_slide={self.window_slide} must be between 1 and --policy.window={self.window}, or "
+                "0 for half a window."
             )
         self.window_slide = self.window_slide or max(1, self.window // 2)
         if not (self.use_images or self.use_spatial_context):
             raise ValueError(
-                "--policy.use_images=false and --policy.use_spatial_context=false together leave nothing "
-                "to see: keep one of them."
+                "--policy.use_images=false and --policy.use_spatial_context=false together leave the context empty: "
+                "keep one of them."
             )
 
     @property
     def network(self) -> NetworkConfig:
-        """The network's part of the options."""
+        """What the network needs of these options."""
         state, block, scene = encoded_sizes(self.orientation, self.egocentric_blocks)
         return NetworkConfig(
             state_dim=state,
@@ -177,16 +180,16 @@ class LanSARConfig(PreTrainedConfig):
         )
 
     def validate_features(self) -> None:
-        """Check the features LeRobot found in the dataset or env; called when the policy is built.
+        """Checks the features that LeRobot found in the dataset or environment, when the policy is built.
 
         Raises:
-            ValueError: Naming every feature that is missing or of the wrong shape.
+            ValueError: Features are missing or have the wrong shape; the message names each.
         """
         features = {**(self.input_features or {}), **(self.output_features or {})}
         if not features:
-            return  # built by hand: the tensors themselves are checked when they come
+            return  # a policy built by hand; its inputs are checked in `select_action`
         problems = []
-        for name, size in ((OBS_STATE, STATE_DIM), (OBS_ENV_STATE, 24), (ACTION, 7)):
+        for name, size in ((OBS_STATE, STATE_DIM), (OBS_ENV_STATE, ENVIRONMENT_STATE_DIM), (ACTION, 7)):
             if name not in features:
                 problems.append(f"{name} is missing")
             elif tuple(features[name].shape) != (size,):
@@ -194,9 +197,8 @@ class LanSARConfig(PreTrainedConfig):
         if problems:
             raise ValueError(
                 f"LanSAR cannot use these features: {'; '.join(problems)}. It needs observation.state (15,), "
-                "observation.environment_state (24,) and action (7,) in CALVIN's conventions, as "
-                "lansar-convert writes them and --env.type=calvin provides them, without task_in_state: LanSAR reads "
-                "the command itself."
+                "observation.environment_state (24,) and action (7,) in CALVIN's conventions, as lansar-convert writes "
+                "them and --env.type=calvin provides them. Leave task_in_state off: LanSAR reads the command itself."
             )
         if not self.use_images and self.input_features:
             for name in [k for k, f in self.input_features.items() if f.type is FeatureType.VISUAL]:
@@ -208,7 +210,7 @@ class LanSARConfig(PreTrainedConfig):
     def get_scheduler_preset(self) -> LinearWarmupDecaySchedulerConfig:
         return LinearWarmupDecaySchedulerConfig(warmup_fraction=self.warmup_fraction)
 
-    # Windows come from memory-mapped arrays (windows.py): LeRobot's own windowed reading is slow.
+    # None: LeRobot reads single frames. `windows.py` makes windows of them, much faster than delta timestamps.
     @property
     def observation_delta_indices(self) -> None:
         return None

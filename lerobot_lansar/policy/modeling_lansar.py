@@ -1,4 +1,4 @@
-"""LanSAR for LeRobot: the loss in training; at inference one action per step, a history per environment."""
+"""LanSAR for LeRobot: the loss in training; at inference one action per step, with a history per environment."""
 
 import logging
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from torch import Tensor
 
 from ..calvin import ANGLE_UNIT, CONTROL_MODES, POSITION_UNIT, wrap_angle
 from .configuration_lansar import LanSARConfig
-from .network import DecoderCache, LanSARNetwork
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_GROUP, VALID_STEPS
-from .scaling import SCENE_DIM, STATE_DIM, Scaler
+from .network import LanSARNetwork
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, VALID_STEPS
+from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
 from .windows import Windows, set_current
 
 
 @dataclass
 class History:
-    """What one environment's episode has been since its history was last cleared.
+    """What happened in one environment since its history was last cleared.
 
     Attributes:
         command: The sentence being carried out.
         projections: C for the memory and for the target, (1, h) each; None before the first step.
-        steps: Control steps since then; the window below may be shorter.
-        contexts: E of the last steps, (length, h); each is computed once and kept.
-        states: X_target of the last steps, (length, h).
+        steps: Control steps so far; the window may hold fewer.
+        contexts: E of the steps in the window, (length, h), each computed once.
+        states: X for the target, (length, h), likewise.
     """
 
     command: str
@@ -39,8 +39,9 @@ class History:
 
 
 class LossParts:
-    """Loss terms by name that become numbers when they are read, as LeRobot's metrics do after the update: reading
-    them in `forward` would make a GPU wait. No Mapping, which Accelerate would take apart in mixed precision.
+    """Loss terms converted to floats only when read, so `forward` never synchronises the GPU.
+
+    Not a Mapping: Accelerate would recurse into it.
     """
 
     def __init__(self, terms: dict[str, Tensor]) -> None:
@@ -58,13 +59,12 @@ class LanSARPolicy(PreTrainedPolicy):
 
     Args:
         config: All options.
-        dataset_stats: Ignored, LanSAR scales with statistics of its own.
-        dataset_meta: Given in training only. The policy then computes its scaling statistics from all the
-            dataset's frames (a checkpoint's own replace them afterwards) and makes the training windows
-            available to its preprocessor.
+        dataset_stats: Ignored: LanSAR scales with its own statistics.
+        dataset_meta: Given in training only. The policy then computes its scaling statistics from all frames of the
+            dataset (a checkpoint's replace them afterwards) and gives the training windows to its preprocessor.
 
     Raises:
-        ValueError, FileNotFoundError: The dataset lacks something; the message says what.
+        ValueError, FileNotFoundError: The dataset or the options cannot be used; the message says why.
     """
 
     config_class = LanSARConfig
@@ -84,8 +84,8 @@ class LanSARPolicy(PreTrainedPolicy):
             if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
                 logging.warning(
                     "LanSAR does not read this dataset's videos, but LeRobot decodes them for every sample: "
-                    "train on a copy without them (lansar-convert --images=none, with "
-                    "--embed=true for a policy that looks at pictures)."
+                    "train on a copy without them (lansar-convert --images=none, with --embed=true for a policy that "
+                    "reads pictures)."
                 )
             windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
             self.scaler.fit(
@@ -97,54 +97,54 @@ class LanSARPolicy(PreTrainedPolicy):
         self.reset()
 
     def _check_pretrained(self) -> None:
-        """Weights that go on being trained must mean what they meant. Other options change a shape and fail by it."""
+        """Rejects options that would silently change what pretrained weights mean; others fail by shape."""
         if not self.config.pretrained_path:
             return
         trained = PreTrainedConfig.from_pretrained(self.config.pretrained_path)
         assert isinstance(trained, LanSARConfig)
         for name in ("target", "mlp_norm", "context_heads", "decoder_heads", "command_prepended"):
-            asked, made_for = getattr(self.config, name), getattr(trained, name)
-            if asked != made_for:
+            given, expected = getattr(self.config, name), getattr(trained, name)
+            if given != expected:
                 raise ValueError(
-                    f"--policy.{name}={asked}: {self.config.pretrained_path} was trained with {name}={made_for}, for "
-                    "which its weights and scaling are made. Leave the option out, or train anew."
+                    f"--policy.{name}={given}: {self.config.pretrained_path} was trained with {name}={expected}, on "
+                    "which its weights and scaling depend. Omit the option, or train a new policy."
                 )
 
     def get_optim_params(self) -> Any:
         return list(self.parameters())
 
     def reset(self) -> None:
-        """Forget every environment's history; LeRobot calls this when a batch of episodes begins."""
+        """Clears all histories; LeRobot calls this before each batch of episodes."""
         self._histories: list[History] = []
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, LossParts]:
         """Loss of a batch of windows, averaged over their valid steps (Eq 4.3-4.6).
 
         Args:
-            batch: What the preprocessor makes of sampled frames, see `processor_lansar.py`.
+            batch: From the preprocessor, see `processor_lansar.py`.
 
         Returns:
-            The scalar loss, and its parts.
+            The scalar loss, and its terms.
+
+        Raises:
+            ValueError: The batch holds no windows.
         """
         if VALID_STEPS not in batch or CLIP_COMMAND not in batch:
             raise ValueError("LanSAR's forward needs windows: pass the batch through its preprocessor first.")
-        rows = batch[VALID_STEPS]
-        state = batch[OBS_STATE]
+        valid_steps, state = batch[VALID_STEPS], batch[OBS_STATE]
         if self.training and self.config.state_noise:
-            noise = self.config.state_noise * torch.randn_like(state)
-            noise[..., -1] = 0  # the gripper action stays -1 or +1
-            state = state + noise
-            state = torch.cat([state[..., :3], wrap_angle(state[..., 3:6]), state[..., 6:]], dim=-1)
-        state, blocks, scene = self.scaler.encode(state, batch[OBS_ENV_STATE])
-        static, gripper = (batch.get(key) for key in CLIP_IMAGE.values())
-        command, same = batch[CLIP_COMMAND], batch.get(COMMAND_GROUP)
-        motion, logit, contrast = self.network(command, state, blocks, scene, rows, static, gripper, same)
-        goal = batch[ACTION].flatten(0, 1)[rows]  # (N, 7)
-        delta = self.scaler.scale_delta(goal[:, :6])
+            state = self._add_noise(state)
+        inputs = self.scaler.encode(state, batch[OBS_ENV_STATE])
+        pictures = (batch.get(key) for key in CLIP_IMAGE.values())
+        motion, logit, contrast = self.network(
+            batch[CLIP_COMMAND], *inputs, valid_steps, *pictures, batch.get(COMMAND_TASKS)
+        )
+        target = batch[ACTION].flatten(0, 1)[valid_steps]  # (N, 7)
+        delta = self.scaler.scale_delta(target[:, :6])
         beta = self.config.smooth_l1_beta
         position = F.smooth_l1_loss(motion[:, :3], delta[:, :3], beta=beta)
         orientation = F.smooth_l1_loss(motion[:, 3:], delta[:, 3:], beta=beta)
-        open_close = F.binary_cross_entropy_with_logits(logit, goal[:, 6])
+        open_close = F.binary_cross_entropy_with_logits(logit, target[:, 6])
         parts = {"position_loss": position, "orientation_loss": orientation, "gripper_loss": open_close}
         loss = position + orientation + open_close
         if contrast is not None:
@@ -152,24 +152,31 @@ class LanSARPolicy(PreTrainedPolicy):
             loss = loss + self.config.contrastive_weight * contrast
         return loss, LossParts(parts)
 
+    def _add_noise(self, state: Tensor) -> Tensor:
+        """(B, n, 15) -> the same with normal noise of `state_noise`."""
+        noise = self.config.state_noise * torch.randn_like(state)
+        noise[..., -1] = 0  # the gripper action stays -1 or +1
+        state = state + noise
+        return torch.cat([state[..., :3], wrap_angle(state[..., 3:6]), state[..., 6:]], dim=-1)
+
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        raise NotImplementedError("LanSAR decides one action at a time: use select_action.")
+        raise NotImplementedError("LanSAR predicts one action at a time, no action chunks: use select_action.")
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """One action per environment.
 
         Args:
-            batch: A preprocessed env observation: observation.state (B, 15), observation.environment_state
-                (B, 24), observation.clip.* (B, D), task: B sentences, and, if the env says so,
+            batch: A preprocessed observation: observation.state (B, 15), observation.environment_state (B, 24),
+                observation.clip.* (B, D), task (B sentences) and, if the environment provides it,
                 observation.control_mode (B, 1).
 
         Returns:
-            (B, 7) float32. "abs": TCP target xyz (m), euler xyz (rad), gripper -1/+1. "rel": differences in
-            units of (0.02 m, 0.05 rad) clipped to +-1, gripper -1/+1.
+            (B, 7) float32. "abs": TCP xyz (m) and Euler xyz (rad) to go to, gripper -1/+1. "rel": differences to the
+            current pose in units of (0.02 m, 0.05 rad) clipped to +-1, gripper -1/+1.
 
         Raises:
-            ValueError: Wrong shapes, NaN, or an env in the other control mode.
+            ValueError: Wrong shapes, NaN, or an environment with the other control mode.
         """
         if self.training:
             self.eval()
@@ -177,16 +184,16 @@ class LanSARPolicy(PreTrainedPolicy):
         self._check(batch, state, environment_state)
         inputs = [state, environment_state, batch[CLIP_COMMAND]]
         inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
-        self._recall(batch["task"])
-        with torch.autocast(state.device.type, enabled=False):  # one step is too little work to gain from it
+        self._clear_old_histories(batch["task"])
+        with torch.autocast(state.device.type, enabled=False):  # mixed precision does not speed up a single step
             return self._act(*inputs)
 
     def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor) -> None:
-        sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, SCENE_DIM + 18))
+        sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, ENVIRONMENT_STATE_DIM))
         for name, value, size in sizes:
             if value.ndim != 2 or value.shape[1] != size:
-                told = " LanSAR reads the command itself: --env.task_in_state=false." if name == OBS_ENV_STATE else ""
-                raise ValueError(f"{name} must be (B, {size}), got {tuple(value.shape)}.{told}")
+                hint = " LanSAR reads the command itself: --env.task_in_state=false." if name == OBS_ENV_STATE else ""
+                raise ValueError(f"{name} must be (B, {size}), got {tuple(value.shape)}.{hint}")
             if not value.isfinite().all():
                 rows = (~value.isfinite().all(dim=1)).nonzero().flatten().tolist()
                 raise ValueError(f"{name} is NaN or infinite in environment {rows} of the batch.")
@@ -198,23 +205,22 @@ class LanSARPolicy(PreTrainedPolicy):
                 env, mine = CONTROL_MODES[int(value)], self.config.control_mode
                 if env != mine:
                     raise ValueError(
-                        f"The environment takes {env} actions (--env.control_mode={env}), this policy "
-                        f"returns {mine} ones (--policy.control_mode={mine}). "
+                        f"The environment expects {env} actions (--env.control_mode={env}), but this policy returns "
+                        f"{mine} actions (--policy.control_mode={mine}). "
                         f"Set --env.control_mode={mine} or --policy.control_mode={env}."
                     )
 
-    def _recall(self, tasks: list[str]) -> None:
-        """Keep each environment's history, empty where its command changed or the time to forget has come."""
-        if len(self._histories) != len(tasks):
-            parameter = self.network.cls.weight
-            self._histories = [self._blank("") for _ in tasks]
-            self._cache = DecoderCache(self.network.config, len(tasks), parameter)
-        for i, (history, command) in enumerate(zip(self._histories, tasks, strict=True)):
+    def _clear_old_histories(self, commands: list[str]) -> None:
+        """Clears the history of each environment whose command changed or that reached `history_clear_steps`."""
+        if len(self._histories) != len(commands):
+            self._histories = [self._empty_history("") for _ in commands]
+            self._cache = self.network.new_cache(len(commands))
+        for i, (history, command) in enumerate(zip(self._histories, commands, strict=True)):
             if history.command != command or history.steps >= self.config.history_clear_steps:
-                self._histories[i] = self._blank(command)
+                self._histories[i] = self._empty_history(command)
                 self._cache.steps[i] = 0
 
-    def _blank(self, command: str) -> History:
+    def _empty_history(self, command: str) -> History:
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
         return History(command, None, 0, empty, empty)
 
@@ -226,52 +232,60 @@ class LanSARPolicy(PreTrainedPolicy):
         static: Tensor | None = None,
         gripper: Tensor | None = None,
     ) -> Tensor:
-        """Take one step into the histories and decide: (B, 15), (B, 24), (B, D)... -> (B, 7)."""
-        config, network, histories = self.config, self.network, self._histories
+        """Appends one step to the histories and predicts: (B, 15), (B, 24), (B, D)... -> actions (B, 7)."""
         x, blocks, scene = self.scaler.encode(state, environment_state)
-        for i, history in enumerate(histories):
+        commands = self._encode_commands(command)
+        modalities = self.network.encode_modalities(x, blocks, scene, static, gripper)
+        contexts = self.network.encode_context(modalities, commands[0])  # (B, h)
+        self._append(contexts, self.network.state_target(x))
+        motion, logit = self.network.predict(self._decode_newest(commands))
+        return self._to_action(state, motion, logit)
+
+    def _encode_commands(self, command: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, D) -> C for memory and target, (B, h) each, computed once per history."""
+        projections = []
+        for i, history in enumerate(self._histories):
             if history.projections is None:
-                history.projections = network.encode_command(command[i : i + 1])
-        projections = [h.projections for h in histories if h.projections is not None]
-        commands = torch.cat([c for c, _ in projections]), torch.cat([c for _, c in projections])
-        modalities = network.modalities(x, blocks, scene, static, gripper)
-        contexts = network.encode_context(modalities, commands[0])  # (B, h)
-        states = network.state_target(x)
-        for i, history in enumerate(histories):
-            if len(history.contexts) == config.window:  # forget the oldest steps, move the others up
-                history.contexts = history.contexts[config.window_slide :]
-                history.states = history.states[config.window_slide :]
-                self._cache.steps[i] = 0
+                history.projections = self.network.encode_command(command[i : i + 1])
+            projections.append(history.projections)
+        return torch.cat([memory for memory, _ in projections]), torch.cat([target for _, target in projections])
+
+    def _append(self, contexts: Tensor, states: Tensor) -> None:
+        """Adds one step, (B, h) each, to the histories; a full window first drops its oldest steps."""
+        for i, history in enumerate(self._histories):
+            if len(history.contexts) == self.config.window:
+                history.contexts = history.contexts[self.config.window_slide :]
+                history.states = history.states[self.config.window_slide :]
+                self._cache.steps[i] = 0  # all positions have changed
             history.steps += 1
             history.contexts = torch.cat([history.contexts, contexts[i : i + 1]])
             history.states = torch.cat([history.states, states[i : i + 1]])
-        last = self._decode(commands)
-        length = torch.tensor([len(history.contexts) for history in histories], device=state.device)
-        motion, logit = network.predict(last)
+
+    def _decode_newest(self, commands: tuple[Tensor, Tensor]) -> Tensor:
+        """The decoder's output at each environment's newest step, (B, h); steps in the cache are not decoded again."""
+        newest = torch.empty_like(commands[0])
+        groups: dict[tuple[int, bool], list[int]] = {}  # environments with the same number of new steps
+        for i, (history, held) in enumerate(zip(self._histories, self._cache.steps, strict=True)):
+            groups.setdefault((len(history.contexts) - held, held == 0), []).append(i)
+        for (new, _), members in groups.items():
+            cache = self._cache.add(members, new)
+            histories = [self._histories[i] for i in members]
+            contexts = torch.stack([history.contexts[-new:] for history in histories])
+            states = torch.stack([history.states[-new:] for history in histories])
+            command = commands[0][members], commands[1][members]
+            newest[members] = self.network.decode(contexts, states, command, cache)[:, -1]
+        return newest
+
+    def _to_action(self, state: Tensor, motion: Tensor, logit: Tensor) -> Tensor:
+        """Robot state (B, 15), scaled motion (B, 6) and gripper logits (B,) -> actions (B, 7) in the control mode."""
+        config = self.config
+        length = torch.tensor([len(history.contexts) for history in self._histories], device=state.device)
         delta = self.scaler.unscale_delta(motion)
         scale = config.position_scale_start - config.position_scale_slope * length / config.window  # Eq 4.8
         position = delta[:, :3] * scale[:, None]
         orientation = delta[:, 3:] * delta.new_tensor([1.0, 1.0, config.yaw_scale])
-        grip = torch.where(logit > 0, 1.0, -1.0)[:, None]
+        gripper = torch.where(logit > 0, 1.0, -1.0)[:, None]
         if config.control_mode == "abs":
-            return torch.cat([state[:, :3] + position, wrap_angle(state[:, 3:6] + orientation), grip], dim=1)
+            return torch.cat([state[:, :3] + position, wrap_angle(state[:, 3:6] + orientation), gripper], dim=1)
         relative = torch.cat([position / POSITION_UNIT, orientation / ANGLE_UNIT], dim=1)
-        return torch.cat([relative.clamp(-1, 1), grip], dim=1)
-
-    def _decode(self, commands: tuple[Tensor, Tensor]) -> Tensor:
-        """The decoder's output at every row's newest step, (B, h); only steps that are not in the cache cost
-        anything.
-        """
-        last = torch.empty_like(commands[0])
-        groups: dict[tuple[int, bool], list[int]] = {}  # rows that need the same number of new steps
-        for row, (history, held) in enumerate(zip(self._histories, self._cache.steps, strict=True)):
-            groups.setdefault((len(history.contexts) - held, held == 0), []).append(row)
-        for (new, _), members in groups.items():
-            past = self._cache.add(members, new)
-            histories = [self._histories[row] for row in members]
-            contexts = torch.stack([history.contexts[-new:] for history in histories])
-            states = torch.stack([history.states[-new:] for history in histories])
-            command = commands[0][members], commands[1][members]
-            decoded = self.network.decode(contexts, states, command, past)
-            last[members] = decoded[:, -1]
-        return last
+        return torch.cat([relative.clamp(-1, 1), gripper], dim=1)

@@ -1,6 +1,6 @@
-"""The LanSAR network: tensors in, tensors out. Nothing here knows LeRobot, CLIP's weights or the simulator.
+"""The LanSAR network: tensors in, tensors out. It knows nothing of LeRobot, CLIP's weights or the simulator.
 
-Letters used in the shape comments:
+Letters in the shape comments:
 
     B  windows in the batch                     N  valid (not padded) steps of all windows together
     n  steps of the longest window              k  tokens of one timestep, CLS included
@@ -20,9 +20,8 @@ A window of timesteps becomes two sequences with the command C in front of every
                                                            1  1  1  .   C
                                                            1  1  1  1   X_1
 
-Windows are padded at their END only. The causal mask therefore already hides padding from every valid step:
-no separate padding mask is needed, and no padded step ever enters an MLP (it would poison BatchNorm's
-statistics).
+Windows are padded at their END only, so the causal mask already hides padding from every valid step and no padding
+mask is needed. Padded steps never enter an MLP, where they would distort BatchNorm's statistics.
 """
 
 from collections.abc import Iterator
@@ -33,54 +32,39 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .cache import CacheView, KeyValueCache, token_count
+
+CONTRAST_TEMPERATURE = 0.07  # CLIP's initial temperature
+
 
 @dataclass
 class NetworkConfig:
-    """Sizes and choices of the network; the defaults are Table 4.2 (6 decoder heads do not divide 512: 8).
+    """Sizes and choices of the network, built by `LanSARConfig.network`; `LanSARConfig` explains the options."""
 
-    Attributes:
-        state_dim: Numbers in the encoded robot state X.
-        block_dim: Numbers per encoded block B.
-        scene_dim: Numbers in the scene state S.
-        clip_dim: D, size of the CLIP embeddings of command and images.
-        mlp_norm: Normalisation inside the MLPs, "batch" (thesis) or "layer".
-        use_images: Tokens I and G take part in the context.
-        use_spatial_context: Tokens X, B (x3) and S take part in the context (the decoder's target keeps X
-            anyway).
-        command_in_context: The command is one more context token (section 6.5.1), and CLS asks with it: what E_t
-            keeps of a timestep depends on the command already in the first context layer.
-        command_prepended: C stands once at the front of memory and target instead of before every step (Table
-            5.3).
-        contrastive: `forward` also returns a contrastive loss between commands and windows (section 6.5.1).
-    """
-
-    state_dim: int = 15
-    block_dim: int = 6
-    scene_dim: int = 6
-    clip_dim: int = 512
-    hidden: int = 512
-    context_layers: int = 6
-    context_heads: int = 16
-    decoder_layers: int = 6
-    decoder_heads: int = 8
-    feedforward: int = 2048
-    dropout: float = 0.1
-    window: int = 64
-    mlp_norm: str = "batch"
-    use_images: bool = True
-    use_spatial_context: bool = True
-    command_in_context: bool = False
-    command_prepended: bool = False
-    contrastive: bool = False
-
-
-CONTRAST_TEMPERATURE = 0.07  # CLIP's initial one
+    state_dim: int  # numbers in the encoded robot state X
+    block_dim: int  # numbers per encoded block B
+    scene_dim: int  # numbers in the scene state S
+    clip_dim: int  # D
+    hidden: int  # h
+    context_layers: int
+    context_heads: int
+    decoder_layers: int
+    decoder_heads: int
+    feedforward: int
+    dropout: float
+    window: int  # n at most
+    mlp_norm: str  # "batch" or "layer"
+    use_images: bool  # tokens I and G in the context
+    use_spatial_context: bool  # tokens X, B (three of them) and S in the context
+    command_in_context: bool  # token C in the context, and C added to CLS (section 6.5.1)
+    command_prepended: bool  # C once at the front of memory and target (Table 5.3)
+    contrastive: bool  # `forward` also returns a contrastive loss between commands and windows (section 6.5.1)
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """BatchNorm1d that uses its running statistics for a single row, which has no variance of its own.
+    """BatchNorm1d that uses its running statistics for a single row, which has no variance.
 
-    One window means one command row, and a training run's last batch of an epoch can be one window.
+    One window gives one row of commands, and an epoch's last batch may be one window.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -90,11 +74,12 @@ class BatchNorm(nn.BatchNorm1d):
 
 
 def make_norm(kind: str, features: int) -> nn.Module:
+    """BatchNorm for "batch", LayerNorm for "layer"."""
     return BatchNorm(features) if kind == "batch" else nn.LayerNorm(features)
 
 
 def input_mlp(inputs: int, hidden: int, norm: str, dropout: float) -> nn.Sequential:
-    """One modality to the hidden size: rows (N, inputs) -> (N, hidden)."""
+    """Projects one modality to the hidden size: (N, inputs) -> (N, hidden)."""
     sizes = [inputs, hidden // 3, 2 * hidden // 3, hidden]
     layers: list[nn.Module] = []
     for i in range(3):
@@ -105,7 +90,7 @@ def input_mlp(inputs: int, hidden: int, norm: str, dropout: float) -> nn.Sequent
 
 
 def head_mlp(hidden: int, outputs: int, norm: str, dropout: float) -> nn.Sequential:
-    """Decoder output to a prediction: rows (N, hidden) -> (N, outputs)."""
+    """Predicts from the decoder's output: (N, hidden) -> (N, outputs)."""
     first = max(hidden - 256, 64)
     second = max(first - 256, 64)
     layers: list[nn.Module] = []
@@ -115,7 +100,7 @@ def head_mlp(hidden: int, outputs: int, norm: str, dropout: float) -> nn.Sequent
 
 
 class Attention(nn.Module):
-    """Multi-head attention (Eq 2.4-2.8). Keys and values come from `memory`, queries from `x`."""
+    """Multi-head attention (Eq 2.4-2.8): queries from `x`, keys and values from `memory`."""
 
     def __init__(self, hidden: int, heads: int, dropout: float) -> None:
         super().__init__()
@@ -132,20 +117,20 @@ class Attention(nn.Module):
         x: Tensor,
         memory: Tensor,
         causal: bool = False,
-        past: "Past | None" = None,
+        cache: CacheView | None = None,
         slot: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """x (B, t, h), memory (B, s, h) -> (B, t, h). With `past`, keys and values kept in its `slot` come
-        before those of `memory`.
+        """x (B, t, h), memory (B, s, h) -> (B, t, h). With `cache`, the keys and values in its `slot` precede those of
+        `memory`, and its mask is used.
         """
-        # (B, t, h) -> (B, heads, t, h/heads)
+        # (B, t, h) -> (B, heads, t, h / heads)
         q = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         k = self.key(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         v = self.value(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         mask = None
-        if past is not None:
-            k, v = past.extend(slot, k, v)
-            mask, causal = past.mask, False
+        if cache is not None:
+            k, v = cache.update(slot, k, v)
+            mask, causal = cache.mask, False
         if self.weights is not None:
             self.weights.append(attention_weights(q, k, mask, causal))
         p = self.dropout if self.training else 0.0
@@ -153,41 +138,15 @@ class Attention(nn.Module):
         return self.out(y.transpose(1, 2).flatten(2))
 
 
-def attention_weights(q: Tensor, k: Tensor, mask: Tensor | None, causal: bool) -> Tensor:
-    """The weights that scaled_dot_product_attention uses and does not return (Eq 2.4): (B, heads, t, s)."""
-    scores = q @ k.transpose(-2, -1) / q.shape[-1] ** 0.5
-    if causal:
-        mask = torch.ones(scores.shape[-2:], dtype=torch.bool, device=q.device).tril()
-    if mask is not None:
-        scores = scores.masked_fill(~mask, -torch.inf)
-    return scores.softmax(dim=-1)
-
-
-@contextmanager
-def recorded_attention(layers: nn.ModuleList) -> Iterator[dict[str, list[Tensor]]]:
-    """Within it every call of `layers` also keeps its attention weights.
-
-    Yields:
-        {name of the Attention module inside `layers`: its weights (B, heads, t, s), one tensor per call}
-    """
-    modules = {name: module for name, module in layers.named_modules() if isinstance(module, Attention)}
-    records: dict[str, list[Tensor]] = {name: [] for name in modules}
-    for name, module in modules.items():
-        module.weights = records[name]
-    try:
-        yield records
-    finally:
-        for module in modules.values():
-            module.weights = None
-
-
 class FeedForward(nn.Sequential):
+    """The MLP of a transformer layer: (..., h) -> (..., h)."""
+
     def __init__(self, hidden: int, feedforward: int, dropout: float) -> None:
         super().__init__(nn.Linear(hidden, feedforward), nn.ReLU(), nn.Dropout(dropout), nn.Linear(feedforward, hidden))
 
 
 class EncoderLayer(nn.Module):
-    """Post-norm encoder layer, the computation of torch.nn.TransformerEncoderLayer (Eq 2.9, 2.10)."""
+    """Post-norm encoder layer; computes what torch.nn.TransformerEncoderLayer does (Eq 2.9, 2.10)."""
 
     def __init__(self, hidden: int, heads: int, feedforward: int, dropout: float) -> None:
         super().__init__()
@@ -197,14 +156,14 @@ class EncoderLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, queries: int | None = None) -> Tensor:
-        """x (N, k, h) -> (N, queries, h): only the first `queries` tokens are updated and returned."""
+        """x (N, k, h) -> (N, queries, h): only the first `queries` tokens are updated and returned; None is all."""
         q = x[:, :queries]
         q = self.norm1(q + self.dropout(self.attention(q, x)))
         return self.norm2(q + self.dropout(self.feedforward(q)))
 
 
 class DecoderLayer(nn.Module):
-    """Post-norm decoder layer, the computation of torch.nn.TransformerDecoderLayer (Eq 2.14-2.26), causal."""
+    """Post-norm decoder layer, causal; computes what torch.nn.TransformerDecoderLayer does (Eq 2.14-2.26)."""
 
     def __init__(self, hidden: int, heads: int, feedforward: int, dropout: float) -> None:
         super().__init__()
@@ -214,96 +173,24 @@ class DecoderLayer(nn.Module):
         self.norm1, self.norm2, self.norm3 = nn.LayerNorm(hidden), nn.LayerNorm(hidden), nn.LayerNorm(hidden)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, memory: Tensor, past: "Past | None" = None, layer: int = 0) -> Tensor:
-        """x and memory (B, t, h) -> (B, t, h); `layer` is this layer's number in `past`."""
-        attended = self.self_attention(x, x, causal=True, past=past, slot=(layer, 0))
+    def forward(self, x: Tensor, memory: Tensor, cache: CacheView | None = None, layer: int = 0) -> Tensor:
+        """x and memory (B, t, h) -> (B, t, h); `layer` is this layer's number in `cache`."""
+        attended = self.self_attention(x, x, causal=True, cache=cache, slot=(layer, 0))
         x = self.norm1(x + self.dropout(attended))
-        attended = self.cross_attention(x, memory, causal=True, past=past, slot=(layer, 1))
+        attended = self.cross_attention(x, memory, causal=True, cache=cache, slot=(layer, 1))
         x = self.norm2(x + self.dropout(attended))
         return self.norm3(x + self.dropout(self.feedforward(x)))
 
 
-class DecoderCache:
-    """Keys and values of the decoder tokens of several environments (rows), so that a control step costs its own
-    tokens only. A token's keys and values stay right as long as its position in the window does.
-
-    Args:
-        config: The network's.
-        rows: How many environments.
-        like: A parameter; the buffers get its dtype and device.
-
-    Attributes:
-        tokens: (layers, 2: self and cross, 2: keys and values, rows, heads, tokens of a full window, h / heads).
-        steps: How many steps each row holds; setting one to 0 forgets that row.
-    """
-
-    def __init__(self, config: NetworkConfig, rows: int, like: Tensor) -> None:
-        heads, width = config.decoder_heads, config.hidden // config.decoder_heads
-        room = token_count(config, config.window)
-        self.config = config
-        self.tokens = like.new_zeros(config.decoder_layers, 2, 2, rows, heads, room, width)
-        self.steps = [0] * rows
-
-    def add(self, rows: list[int], steps: int) -> "Past":
-        """Makes room for the next `steps` steps of each of `rows`, which are then decoded at once.
-
-        Raises:
-            ValueError: The window is full, or `rows` are at their first step and others are not, where the
-                command stands once at the front.
-        """
-        held = [self.steps[row] for row in rows]
-        if max(held) + steps > self.config.window:
-            raise ValueError(f"the window of {self.config.window} steps is full")
-        if self.config.command_prepended and len({n > 0 for n in held}) > 1:
-            raise ValueError("rows at their first step have one token more than the others")
-        first = [token_count(self.config, n) for n in held]
-        count = token_count(self.config, held[0] + steps) - first[0]
-        for row in rows:
-            self.steps[row] += steps
-        return Past(self.tokens, rows, first, count)
-
-
-class Past:
-    """What attention sees of a DecoderCache while the next tokens of some rows are decoded.
-
-    Attributes:
-        positions: (B, t) place in the window of each new token.
-        mask: (B, 1, t, s) bool, True where a new token may look.
-    """
-
-    def __init__(self, tokens: Tensor, rows: list[int], first: list[int], count: int) -> None:
-        self.tokens, self.end = tokens, max(first) + count
-        device = tokens.device
-        self.rows = torch.tensor(rows, device=device)
-        in_line = rows == list(range(rows[0], rows[0] + len(rows)))
-        self.view = slice(rows[0], rows[0] + len(rows)) if in_line else self.rows  # a slice copies nothing
-        self.positions = torch.tensor(first, device=device)[:, None] + torch.arange(count, device=device)
-        self.mask = (torch.arange(self.end, device=device) <= self.positions[..., None])[:, None]
-
-    def extend(self, slot: tuple[int, int], keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Keeps new keys and values (B, heads, t, h/heads); returns all of the rows, (B, heads, s, h/heads)."""
-        kept = self.tokens[slot]
-        for buffer, new in zip(kept, (keys, values), strict=True):
-            buffer[self.rows[:, None], :, self.positions] = new.transpose(1, 2)
-        return kept[0, self.view, :, : self.end], kept[1, self.view, :, : self.end]
-
-
-def token_count(config: NetworkConfig, steps: int) -> int:
-    """Decoder tokens of a window of so many steps."""
-    if config.command_prepended:
-        return steps + (steps > 0)
-    return 2 * steps
-
-
 class LanSARNetwork(nn.Module):
-    """Command, robot state, scene and pictures of a window in; motion and gripper of every step out."""
+    """Predicts motion and gripper at every step of a window from command, robot state, scene and pictures."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = c = config
         h, norm, p = c.hidden, c.mlp_norm, c.dropout
 
-        # Eq 3.5-3.12: one MLP per modality; the three blocks share one, their position tells them apart.
+        # Eq 3.5-3.12: one MLP per modality. The three blocks share one; positions tell their tokens apart.
         self.command_memory = input_mlp(c.clip_dim, h, norm, p)
         self.command_target = input_mlp(c.clip_dim, h, norm, p)
         self.state_target = input_mlp(c.state_dim, h, norm, p)
@@ -315,7 +202,7 @@ class LanSARNetwork(nn.Module):
             self.static_context = input_mlp(c.clip_dim, h, norm, p)
             self.gripper_context = input_mlp(c.clip_dim, h, norm, p)
 
-        # Eq 3.13-3.16. CLS is an embedding of one row, so that it is initialised like the positions.
+        # Eq 3.13-3.16. CLS is an embedding with one row, so that it is initialised like the positions.
         self.context_tokens = ["CLS"]
         self.context_tokens += ["X", "B_red", "B_blue", "B_pink", "S"] if c.use_spatial_context else []
         self.context_tokens += ["I", "G"] if c.use_images else []
@@ -327,7 +214,7 @@ class LanSARNetwork(nn.Module):
         )
 
         # Eq 3.17-3.23
-        length = 1 + c.window if c.command_prepended else 2 * c.window
+        length = token_count(c.window, c.command_prepended)
         self.memory_position = nn.Embedding(length, h)
         self.target_position = nn.Embedding(length, h)
         self.decoder_layers = nn.ModuleList(
@@ -349,12 +236,58 @@ class LanSARNetwork(nn.Module):
         if isinstance(module, nn.Linear):
             nn.init.zeros_(module.bias)
 
+    def forward(
+        self,
+        command: Tensor,
+        state: Tensor,
+        blocks: Tensor,
+        scene: Tensor,
+        valid_steps: Tensor,
+        static: Tensor | None = None,
+        gripper: Tensor | None = None,
+        command_tasks: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Predictions for every valid step of a batch of windows.
+
+        Args:
+            command: (B, D) CLIP text embeddings.
+            state, blocks, scene: (B, n, state_dim), (B, n, 3, block_dim) and (B, n, scene_dim), all scaled.
+            valid_steps: (N,) int64, which of the B * n steps are not padding, ascending; each window's come first in
+                it. Indices, not a mask: no GPU sync to learn the count.
+            static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
+            command_tasks: (B, tasks) float, 1 for the tasks that each command can mean; needed with `contrastive`.
+
+        Returns:
+            Motion (N, 6) and gripper logits (N,) in the order of `valid_steps`; the contrastive loss, None without
+            `contrastive` or `command_tasks`.
+        """
+        batch, n = state.shape[:2]
+        state, blocks, scene = (x.flatten(0, 1)[valid_steps] for x in (state, blocks, scene))
+        if static is not None and gripper is not None:
+            static, gripper = static.flatten(0, 1)[valid_steps], gripper.flatten(0, 1)[valid_steps]
+        commands = self.encode_command(command)
+        modalities = self.encode_modalities(state, blocks, scene, static, gripper)
+        states = self.state_target(state)
+        contexts = self.encode_context(modalities, commands[0][valid_steps // n])
+
+        def pad(steps: Tensor) -> Tensor:
+            """(N, h) -> (B, n, h), zeros where there is padding."""
+            padded = steps.new_zeros(batch * n, steps.shape[-1]).index_copy(0, valid_steps, steps)
+            return padded.unflatten(0, (batch, n))
+
+        decoded = self.decode(pad(contexts), pad(states), commands)
+        motion, logit = self.predict(decoded.flatten(0, 1)[valid_steps])
+        contrast = None
+        if self.config.contrastive and command_tasks is not None:
+            seen = modalities.mean(dim=1) + states
+            contrast = self.contrastive_loss(command_tasks, commands[0], seen, valid_steps, n)
+        return motion, logit, contrast
+
     def encode_command(self, command: Tensor) -> tuple[Tensor, Tensor]:
-        """CLIP text embeddings (B, D) -> C for the memory (and the context) and C for the target, (B, h)
-        each."""
+        """CLIP text embeddings (B, D) -> C for the memory (and the context), and C for the target: (B, h) each."""
         return self.command_memory(command), self.command_target(command)
 
-    def modalities(
+    def encode_modalities(
         self,
         state: Tensor,
         blocks: Tensor,
@@ -362,16 +295,15 @@ class LanSARNetwork(nn.Module):
         static: Tensor | None = None,
         gripper: Tensor | None = None,
     ) -> Tensor:
-        """What is perceived at N timesteps, one token per modality (Eq 3.6-3.12).
+        """One token per modality at each of N timesteps (Eq 3.6-3.12).
 
         Args:
-            state: (N, state_dim) encoded and scaled robot state.
-            blocks: (N, 3, block_dim), red, blue, pink.
-            scene: (N, scene_dim).
+            state, blocks, scene: (N, state_dim), (N, 3, block_dim) for red, blue and pink, and (N, scene_dim), all
+                scaled.
             static, gripper: (N, D) CLIP embeddings of the two pictures; read only with `use_images`.
 
         Returns:
-            (N, m, h), the m tokens that the configuration admits.
+            (N, m, h), the m tokens that the configuration has besides CLS and C.
         """
         c = self.config
         tokens = []
@@ -385,18 +317,18 @@ class LanSARNetwork(nn.Module):
         return torch.cat(tokens, dim=1)
 
     def encode_context(self, modalities: Tensor, command: Tensor) -> Tensor:
-        """E_t of N timesteps, each on its own (Eq 3.13-3.16).
+        """E_t of N timesteps, each encoded by itself (Eq 3.13-3.16).
 
         Args:
             modalities: (N, m, h).
-            command: (N, h) C of each timestep's window; read only with `command_in_context`.
+            command: (N, h), C of each timestep's window; read only with `command_in_context`.
 
         Returns:
             (N, h)
         """
         tokens = [self.cls.weight.expand(len(modalities), 1, -1), modalities]
         if self.config.command_in_context:
-            # A token alone cannot change which of the others CLS attends to in a single layer; its query can.
+            # A single layer with C as a token only cannot change what CLS attends to; C in CLS's query can.
             tokens[0] = tokens[0] + command[:, None]
             tokens.append(command[:, None])
         x = torch.cat(tokens, dim=1) + self.context_position.weight  # (N, k, h)
@@ -406,104 +338,112 @@ class LanSARNetwork(nn.Module):
         return x[:, 0]
 
     def decode(
-        self, contexts: Tensor, states: Tensor, command: tuple[Tensor, Tensor], past: Past | None = None
+        self, contexts: Tensor, states: Tensor, command: tuple[Tensor, Tensor], cache: CacheView | None = None
     ) -> Tensor:
-        """What the decoder says at every X_t (Eq 3.17-3.24).
+        """The decoder's output at every X_t (Eq 3.17-3.24).
 
         Args:
-            contexts: E, (B, n, h); steps past a window's end may hold anything finite.
-            states: X_target, (B, n, h); likewise.
+            contexts: E, (B, n, h); padding may hold anything finite.
+            states: X for the target, (B, n, h); likewise.
             command: C for memory and target, (B, h) each, from `encode_command`.
-            past: From `DecoderCache.add`, when the n steps are not the window's first ones: the result is then
-                the same as that of the whole window, to rounding, at the cost of n steps.
+            cache: From `KeyValueCache.add`. The n steps then follow those in the cache; up to rounding, the result is
+                the same as when the whole window is decoded.
 
         Returns:
             (B, n, h)
         """
         n = contexts.shape[1]
-        memory = self._with_command(contexts, command[0])
-        target = self._with_command(states, command[1])
-        if past is None:
+        memory = self._add_command(contexts, command[0])
+        target = self._add_command(states, command[1])
+        if cache is None:
             positions: Tensor | slice = slice(target.shape[1])
         else:
-            positions = past.positions
+            positions = cache.positions
+            # A prepended C is a new token at the first step only.
             memory, target = memory[:, -positions.shape[1] :], target[:, -positions.shape[1] :]
         memory = memory + self.memory_position.weight[positions]
         target = target + self.target_position.weight[positions]
         for i, layer in enumerate(self.decoder_layers):
-            target = layer(target, memory, past, i)
+            target = layer(target, memory, cache, i)
         return target[:, -n:] if self.config.command_prepended else target[:, 1::2]
 
-    def _with_command(self, steps: Tensor, command: Tensor) -> Tensor:
+    def _add_command(self, steps: Tensor, command: Tensor) -> Tensor:
         """(B, n, h) and (B, h) -> C s C s C s ... (B, 2n, h), or prepended C s s s ... (B, 1 + n, h)."""
         if self.config.command_prepended:
             return torch.cat([command[:, None], steps], dim=1)
         return torch.stack([command[:, None].expand_as(steps), steps], dim=2).flatten(1, 2)
 
     def predict(self, decoded: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, h) -> scaled motion (N, 6): position then orientation, and gripper logits (N,): > 0 is open."""
+        """(N, h) -> scaled motion (N, 6), position then orientation, and gripper logits (N,), above 0 for open."""
         return self.motion_head(decoded), self.gripper_head(decoded)[:, 0]
 
-    def forward(
-        self,
-        command: Tensor,
-        state: Tensor,
-        blocks: Tensor,
-        scene: Tensor,
-        rows: Tensor,
-        static: Tensor | None = None,
-        gripper: Tensor | None = None,
-        group: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Predictions for every valid step of a batch of windows.
+    def contrastive_loss(
+        self, command_tasks: Tensor, commands: Tensor, seen: Tensor, valid_steps: Tensor, n: int
+    ) -> Tensor:
+        """Pulls each command towards the windows that carry it out and pushes it from the others (section 6.5.1).
+
+        A window is described by the mean of what is seen in it and by how that changes from its first to its last
+        step, before command and perception meet. Windows of the same task are no negatives.
 
         Args:
-            command: (B, D) CLIP text embeddings.
-            state: (B, n, state_dim); blocks: (B, n, 3, block_dim); scene: (B, n, scene_dim), all scaled.
-            rows: (N,) int64, places of the valid steps among the B * n, ascending. The valid steps of a window
-                come first in it. Given as numbers and not as a mask, so that a GPU need not tell how many.
-            static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
-            group: (B, tasks) float, 1 for the tasks that a command asks for; needed with `contrastive`.
-
-        Returns:
-            Motion (N, 6) and gripper logits (N,), in the order of `rows`; the contrastive loss, None without
-            `contrastive` or `group`.
+            command_tasks: (B, tasks), 1 for the tasks that each command can mean.
+            commands: (B, h), C for the memory.
+            seen: (N, h), what is seen at each valid step.
+            valid_steps: (N,), which of the B * n steps are not padding.
+            n: Steps of the longest window.
         """
-        batch, n = state.shape[:2]
-        state, blocks, scene = (x.flatten(0, 1)[rows] for x in (state, blocks, scene))
-        if static is not None and gripper is not None:
-            static, gripper = static.flatten(0, 1)[rows], gripper.flatten(0, 1)[rows]
-        commands = self.encode_command(command)
-        modalities, target = self.modalities(state, blocks, scene, static, gripper), self.state_target(state)
-        contexts, states = (
-            steps.new_zeros(batch * n, steps.shape[-1]).index_copy(0, rows, steps).unflatten(0, (batch, n))
-            for steps in (self.encode_context(modalities, commands[0][rows // n]), target)
-        )
-        motion, logit = self.predict(self.decode(contexts, states, commands).flatten(0, 1)[rows])
-        contrast = None
-        if self.config.contrastive and group is not None:
-            seen = modalities.mean(dim=1) + target
-            contrast = self._contrast(group, commands[0], seen, rows, batch, n)
-        return motion, logit, contrast
-
-    def _contrast(self, group: Tensor, projected: Tensor, seen: Tensor, rows: Tensor, batch: int, n: int) -> Tensor:
-        """Pulls a command towards the windows that carry it out, away from the others (section 6.5.1).
-
-        A window is described by what is seen in it on average and by how that changes from its first to its
-        last step, before command and perception meet. Windows of the same task are not held against it.
-
-        Args:
-            group: (B, tasks) 1 for the tasks that a command asks for; projected: (B, h) the commands.
-            seen: (N, h) what is perceived at each valid step; rows: (N,) their places; batch: B; n: steps.
-        """
-        bounds = torch.arange(batch + 1, device=rows.device) * n
-        bounds = torch.searchsorted(rows, bounds)  # (B + 1,) where each window begins among the N
-        sums = seen.new_zeros(batch, seen.shape[-1]).index_add(0, rows // n, seen)
+        batch = len(commands)
+        bounds = torch.arange(batch + 1, device=valid_steps.device) * n
+        bounds = torch.searchsorted(valid_steps, bounds)  # (B + 1,) where each window begins among the N
+        sums = seen.new_zeros(batch, seen.shape[-1]).index_add(0, valid_steps // n, seen)
         mean = sums / bounds.diff()[:, None]
         change = seen[bounds[1:] - 1] - seen[bounds[:-1]]
         windows = F.normalize(self.window_projection(torch.cat([mean, change], dim=1)), dim=1)
-        commands = F.normalize(self.command_projection(projected), dim=1)
+        commands = F.normalize(self.command_projection(commands), dim=1)
         logits = commands @ windows.T / CONTRAST_TEMPERATURE
-        same = ((group @ group.T > 0) | torch.eye(batch, dtype=torch.bool, device=group.device)).float()
-        goal = same / same.sum(dim=1, keepdim=True)
-        return (F.cross_entropy(logits, goal) + F.cross_entropy(logits.T, goal)) / 2
+        itself = torch.eye(batch, dtype=torch.bool, device=command_tasks.device)
+        matches = ((command_tasks @ command_tasks.T > 0) | itself).float()
+        labels = matches / matches.sum(dim=1, keepdim=True)  # (B, B), each row adds up to 1
+        return (F.cross_entropy(logits, labels) + F.cross_entropy(logits.T, labels)) / 2
+
+    def new_cache(self, environments: int) -> KeyValueCache:
+        """An empty key-value cache for the decoder."""
+        c = self.config
+        head_size = c.hidden // c.decoder_heads
+        return KeyValueCache(
+            environments,
+            c.decoder_layers,
+            c.decoder_heads,
+            head_size,
+            c.window,
+            c.command_prepended,
+            like=self.cls.weight,
+        )
+
+
+def attention_weights(q: Tensor, k: Tensor, mask: Tensor | None, causal: bool) -> Tensor:
+    """The weights that scaled_dot_product_attention uses but does not return (Eq 2.4): (B, heads, t, s)."""
+    scores = q @ k.transpose(-2, -1) / q.shape[-1] ** 0.5
+    if causal:
+        mask = torch.ones(scores.shape[-2:], dtype=torch.bool, device=q.device).tril()
+    if mask is not None:
+        scores = scores.masked_fill(~mask, -torch.inf)
+    return scores.softmax(dim=-1)
+
+
+@contextmanager
+def recorded_attention(layers: nn.ModuleList) -> Iterator[dict[str, list[Tensor]]]:
+    """Within this context, every call of `layers` also records its attention weights.
+
+    Yields:
+        {Name of the Attention module inside `layers`: its weights (B, heads, t, s), one tensor per call}.
+    """
+    modules = {name: module for name, module in layers.named_modules() if isinstance(module, Attention)}
+    records: dict[str, list[Tensor]] = {name: [] for name in modules}
+    for name, module in modules.items():
+        module.weights = records[name]
+    try:
+        yield records
+    finally:
+        for module in modules.values():
+            module.weights = None

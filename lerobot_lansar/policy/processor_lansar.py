@@ -1,18 +1,26 @@
-"""LanSAR's preprocessing as LeRobot pipeline steps: windows for training, CLIP embeddings for both.
+"""LanSAR's preprocessing as LeRobot pipeline steps: windows for training, CLIP embeddings always.
 
     training                                            evaluation
     sampled frames  {index (B,), task, ...}             env observation {state (B, 15), images, task, ...}
-      WindowStep    state, environment_state,             passes (no index)
-                    action = targets: (B, n, ...)
-      ClipStep      command from the task string          command from the task string
-                    (pictures are embedded already)       pictures -> embeddings
+      WindowStep    state, environment_state and          does nothing (no index)
+                    action (the targets): (B, n, ...)
+      ClipStep      embeds the task sentence              embeds the task sentence
+                    (pictures are embedded already)       and the pictures
 
-After it a batch has, with n steps in training and without that axis in evaluation:
+The batch then holds, in training and (without the axis n) in evaluation:
 
-    observation.state (B, n, 15), observation.environment_state (B, n, 24), action (B, n, 7), valid_steps (N,)
-    in training: places of the steps that are no padding among the B * n, observation.clip.command (B, D),
-    observation.clip.static (B, n, D), observation.clip.gripper (B, n, D), task [B], and for the contrastive loss
-    command_group (B, tasks), 1 for the tasks that a command asks for
+    observation.state              (B, n, 15)
+    observation.environment_state  (B, n, 24)
+    observation.clip.command       (B, D)
+    observation.clip.static        (B, n, D) with `use_images`
+    observation.clip.gripper       (B, n, D) with `use_images`
+    task                           B sentences
+
+and in training only:
+
+    action                         (B, n, 7), the targets
+    valid_steps                    (N,) which of the B * n steps are not padding
+    command_tasks                  (B, tasks) 1 for the tasks that a command can mean; for the contrastive loss
 """
 
 from dataclasses import dataclass, field
@@ -35,7 +43,7 @@ CLIP_COMMAND = "observation.clip.command"
 CLIP_IMAGE = {"static": "observation.clip.static", "gripper": "observation.clip.gripper"}
 
 VALID_STEPS = "valid_steps"
-COMMAND_GROUP = "command_group"
+COMMAND_TASKS = "command_tasks"
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
@@ -43,10 +51,10 @@ Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 @ProcessorStepRegistry.register("lansar_windows")
 @dataclass
 class WindowStep(ProcessorStep):
-    """Replaces sampled frames by the windows they stand for (`windows.py`); passes batches without `index`.
+    """Replaces sampled frames by the windows that they stand for (`windows.py`); leaves batches without `index` alone.
 
-    It has no options of its own: the windows belong to the policy being trained, so that options given on the
-    command line hold in a resumed or fine-tuned run too, where LeRobot would restore a step's saved ones.
+    It has no options: LeRobot would restore saved ones in a resumed or fine-tuned run. The windows belong to the policy
+    being trained, so options on the command line apply there too.
     """
 
     windows: Windows | None = field(default_factory=get_current, init=False, repr=False)
@@ -64,7 +72,7 @@ class WindowStep(ProcessorStep):
         observation = {
             key: value
             for key, value in (transition.get(TransitionKey.OBSERVATION) or {}).items()
-            if not key.startswith("observation.images.")  # their embeddings come instead
+            if not key.startswith("observation.images.")  # embeddings replace pictures
         }
         observation[OBS_STATE] = window["state"]
         observation[OBS_ENV_STATE] = window["environment_state"]
@@ -74,11 +82,11 @@ class WindowStep(ProcessorStep):
         new[TransitionKey.ACTION] = window["target"]
         new[TransitionKey.COMPLEMENTARY_DATA] = {
             **extra,
-            "task": self.windows.say(extra["task"]),
+            "task": self.windows.paraphrase(extra["task"]),
             VALID_STEPS: window["valid_steps"],
         }
-        if (group := self.windows.groups(extra["task"])) is not None:
-            new[TransitionKey.COMPLEMENTARY_DATA][COMMAND_GROUP] = group
+        if (command_tasks := self.windows.command_tasks(extra["task"])) is not None:
+            new[TransitionKey.COMPLEMENTARY_DATA][COMMAND_TASKS] = command_tasks
         return new
 
     def transform_features(self, features: Features) -> Features:
@@ -88,15 +96,14 @@ class WindowStep(ProcessorStep):
 @ProcessorStepRegistry.register("lansar_clip")
 @dataclass
 class ClipStep(ProcessorStep):
-    """Adds the CLIP embeddings of commands and pictures; an embedding that is there already is used as it is.
+    """Adds the CLIP embeddings of commands and pictures, unless the batch has those of its pictures already.
 
-    Weights that cannot be fetched by name (a local file, or untrained) travel in the checkpoint with this
-    step.
+    The checkpoint stores weights that cannot be downloaded by name (from a local file, or random) with this step.
 
     Attributes:
         model, pretrained: See `ClipConfig`.
-        use_images: Whether the policy looks at pictures.
-        weights_sha256: Of the CLIP the policy was trained with; "" before training.
+        use_images: Whether the policy reads pictures.
+        weights_sha256: Hash of the CLIP that the policy was trained with; "" before training.
     """
 
     model: str
@@ -109,10 +116,10 @@ class ClipStep(ProcessorStep):
     _windows: Windows | None = field(default_factory=get_current, init=False, repr=False)
 
     def clip(self, device: torch.device | str | None = None) -> Clip:
-        """The CLIP, built at first use; moved to `device` if one is named.
+        """The CLIP, built at first use and moved to `device` if one is given.
 
         Raises:
-            ValueError: It is not the one the policy or the dataset's embeddings were made with.
+            ValueError: The policy or the dataset's embeddings were made with another CLIP.
         """
         if self._clip is None:
             mine = ClipConfig(self.model, self.pretrained)
@@ -120,7 +127,7 @@ class ClipStep(ProcessorStep):
                 raise ValueError(
                     f"The checkpoint was trained with {mine}; --policy.clip.model={self._windows.clip.model} and "
                     f"--policy.clip.pretrained={self._windows.clip.pretrained} cannot be changed when resuming or "
-                    "fine-tuning. Leave them out."
+                    "fine-tuning. Omit them."
                 )
             clip = Clip(mine, device or "cpu", self._weights)
             made_with = {"policy was trained": self.weights_sha256}
@@ -130,8 +137,8 @@ class ClipStep(ProcessorStep):
                 if expected and expected != clip.weights_sha256:
                     raise ValueError(
                         f"The {what} with other weights of CLIP {self.model} (sha256 {expected[:12]}...) "
-                        f"than pretrained={self.pretrained!r} gives (sha256 {clip.weights_sha256[:12]}...). "
-                        "Convert the dataset again, or set --policy.clip.pretrained of a new policy to those used then."
+                        f"than pretrained={self.pretrained!r} has now (sha256 {clip.weights_sha256[:12]}...). "
+                        "Convert the dataset again, or train a new policy with --policy.clip.pretrained as it was then."
                     )
             self._clip, self.weights_sha256, self._weights = clip, clip.weights_sha256, None
         if device is not None and self._clip.device != torch.device(device):
@@ -141,14 +148,14 @@ class ClipStep(ProcessorStep):
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = dict(transition.get(TransitionKey.OBSERVATION) or {})
-        tasks = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
-        if not tasks:
-            raise ValueError("LanSAR needs a command: no `task` in the batch (from the dataset, or the env).")
+        commands = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
+        if not commands:
+            raise ValueError("LanSAR needs a command: neither the dataset nor the environment gave a `task`.")
         clip = self.clip(observation[OBS_STATE].device)
-        for sentence in set(tasks) - self._commands.keys():
-            # One at a time: it is kept, and must not depend on what else was in the first batch.
+        for sentence in set(commands) - self._commands.keys():
+            # One at a time, so that the stored embedding does not depend on the rest of the batch.
             self._commands[sentence] = clip.encode_texts([sentence])[0]
-        observation[CLIP_COMMAND] = torch.stack([self._commands[sentence] for sentence in tasks])
+        observation[CLIP_COMMAND] = torch.stack([self._commands[sentence] for sentence in commands])
         if self.use_images:
             for name, key in CLIP_IMAGE.items():
                 if key not in observation:
@@ -160,7 +167,7 @@ class ClipStep(ProcessorStep):
     def _embed(self, clip: Clip, observation: dict[str, Any], key: str) -> Tensor:
         if key not in observation:
             raise ValueError(
-                f"This LanSAR looks at pictures, but there is no {key}. Evaluate with "
+                f"This LanSAR reads pictures, but there is no {key}. Evaluate with "
                 "--env.cameras='[static,gripper]', or train one without pictures (--policy.use_images=false)."
             )
         return clip.encode_images(observation[key])
@@ -190,7 +197,7 @@ class ClipStep(ProcessorStep):
 def make_lansar_pre_post_processors(
     config: LanSARConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """The pipelines of a new LanSAR; LeRobot's own steps all stay, its commands override them by name.
+    """The pipelines of a new LanSAR. All of LeRobot's own steps stay, since its commands override them by name.
 
     Args:
         config: The policy's options.

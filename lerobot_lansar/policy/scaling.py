@@ -1,31 +1,37 @@
-"""What the network reads and predicts, in numbers of order one: orientation encoding and standard scaling (Eq
-4.7)."""
+"""Scales what the network reads and predicts to order one (Eq 4.7), after encoding orientations."""
 
 import torch
 from torch import Tensor, nn
 
-STATE_DIM = 15  # robot_obs: TCP xyz, TCP euler xyz, gripper width, 7 arm joints, last gripper action -1/+1
-SCENE_DIM = 6  # scene_obs 0-5: slider, drawer, button, switch joints; bulb, LED 0/1
-BLOCKS = 3  # scene_obs 6-23: red, blue, pink; xyz and euler xyz each
-DELTA_DIM = 6  # position (m) and orientation (rad) difference
+from ..calvin import BLOCKS, COLORS, FURNITURE, FURNITURE_NAMES, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TCP_POSE
 
-# A column that hardly moves in the data (a button nobody pressed) is divided by this instead of its sigma, in
-# its own unit (m or rad): dividing by the sigma of noise would blow up the first real movement at inference.
+STATE_DIM = len(ROBOT_OBS_NAMES)
+"""Numbers in CALVIN's `robot_obs`."""
+ENVIRONMENT_STATE_DIM = len(SCENE_OBS_NAMES)
+"""Numbers in CALVIN's `scene_obs`: furniture, then blocks."""
+SCENE_DIM = len(FURNITURE_NAMES)
+DELTA_DIM = 6
+"""Numbers in a motion: position (m) and orientation (rad) difference."""
+
 INPUT_FLOOR = 1e-2
-NEAR = 0.05  # m; within this distance of the TCP a block's relative position is given in finer steps
+"""Smallest standard deviation of an input, in its own unit (m or rad). A column that hardly moves in the data (a button
+that nobody pressed) would otherwise be divided by that of noise, and its first real movement would be huge."""
 DELTA_FLOOR = 1e-3
+"""The same for motions."""
+NEAR = 0.05
+"""Distance from the TCP (m) within which a block's relative position is also given with finer resolution."""
 
 
 def encoded_sizes(orientation: str, egocentric_blocks: bool) -> tuple[int, int, int]:
-    """Numbers per robot state, block and scene after `Scaler.encode`."""
+    """How many numbers a robot state, a block and the scene have after `Scaler.encode`."""
     extra = 3 if orientation == "sincos" else 0
     return STATE_DIM + extra, 6 + extra + (6 if egocentric_blocks else 0), SCENE_DIM
 
 
 class Scaler(nn.Module):
-    """Mean and sigma of everything that is scaled, kept as buffers: they travel in the checkpoint.
+    """Means and standard deviations of everything that is scaled; buffers, so the checkpoint holds them.
 
-    Binary values (gripper action, lights) keep mean 0 and sigma 1. Until `fit` is called nothing is scaled.
+    Binary values (gripper action, lights) keep mean 0 and standard deviation 1. Before `fit`, nothing is scaled.
     """
 
     state_mean: Tensor
@@ -42,27 +48,27 @@ class Scaler(nn.Module):
         self.orientation = orientation
         self.egocentric_blocks = egocentric_blocks
         state, block, scene = encoded_sizes(orientation, egocentric_blocks)
-        sizes = {"state": state, "blocks": BLOCKS * block, "scene": scene, "delta": DELTA_DIM}
+        sizes = {"state": state, "blocks": len(COLORS) * block, "scene": scene, "delta": DELTA_DIM}
         for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
 
-    def _angles(self, pose: Tensor) -> Tensor:
-        """(..., 6) xyz and euler -> (..., 6), or (..., 9): xyz, sines, cosines, continuous where euler
-        jumps."""
+    def _encode_pose(self, pose: Tensor) -> Tensor:
+        """(..., 6) xyz and Euler angles -> the same; or (..., 9) xyz, sines, cosines, which do not jump at +-pi."""
         if self.orientation == "euler":
             return pose
         position, euler = pose.split(3, dim=-1)
         return torch.cat([position, euler.sin(), euler.cos()], dim=-1)
 
     def _encode(self, state: Tensor, environment_state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        x = torch.cat([self._angles(state[..., :6]), state[..., 6:]], dim=-1)
-        pose = environment_state[..., SCENE_DIM:].unflatten(-1, (BLOCKS, 6))
-        blocks = self._angles(pose)
+        """(..., 15) and (..., 24) -> robot state, flat blocks and scene, not scaled."""
+        x = torch.cat([self._encode_pose(state[..., TCP_POSE]), state[..., TCP_POSE.stop :]], dim=-1)
+        poses = environment_state[..., BLOCKS].unflatten(-1, (len(COLORS), 6))
+        blocks = self._encode_pose(poses)
         if self.egocentric_blocks:
-            offset = pose[..., :3] - state[..., None, :3]  # from the TCP, (..., 3, 3)
+            offset = poses[..., :3] - state[..., None, :3]  # from the TCP, (..., 3, 3)
             blocks = torch.cat([blocks, offset, (offset / NEAR).tanh()], dim=-1)
-        return x, blocks.flatten(-2), environment_state[..., :SCENE_DIM]
+        return x, blocks.flatten(-2), environment_state[..., FURNITURE]
 
     def encode(self, state: Tensor, environment_state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """CALVIN's (..., 15) and (..., 24) -> scaled X (..., 15 or 18), B (..., 3, 6 to 15), S (..., 6)."""
@@ -70,7 +76,7 @@ class Scaler(nn.Module):
         x = (x - self.state_mean) / self.state_std
         blocks = (blocks - self.blocks_mean) / self.blocks_std
         scene = (scene - self.scene_mean) / self.scene_std
-        return x, blocks.unflatten(-1, (BLOCKS, -1)), scene
+        return x, blocks.unflatten(-1, (len(COLORS), -1)), scene
 
     def scale_delta(self, delta: Tensor) -> Tensor:
         """(..., 6) in m and rad -> scaled."""
@@ -82,10 +88,11 @@ class Scaler(nn.Module):
 
     @torch.no_grad()
     def fit(self, state: Tensor, environment_state: Tensor, delta: Tensor) -> None:
-        """Set the statistics from all frames of a dataset.
+        """Sets the statistics from all frames of a dataset.
 
         Args:
-            state: (T, 15); environment_state: (T, 24); delta: (M, 6) the motion targets in m and rad.
+            state, environment_state: (T, 15) and (T, 24).
+            delta: (M, 6) target motions in m and rad.
         """
         x, blocks, scene = self._encode(state, environment_state)
         for name, values, floor in (

@@ -10,14 +10,11 @@ from torch.optim.lr_scheduler import LambdaLR
 @LRSchedulerConfig.register_subclass("linear_warmup_decay")
 @dataclass
 class LinearWarmupDecaySchedulerConfig(LRSchedulerConfig):
-    """Linear warm-up to the optimizer's rate, then linear decay to 0 at the last update.
+    """Linear warm-up to the optimizer's learning rate, then linear decay to 0 at the last update."""
 
-    Attributes:
-        num_warmup_steps: Updates of warm-up; None takes `warmup_fraction` of the run instead.
-        warmup_fraction: 5 of 125 epochs in the thesis. A fraction, so that a shorter run keeps the shape.
-    """
-
+    # Updates of warm-up; None means warmup_fraction of the run.
     num_warmup_steps: int | None = None
+    # Share of the updates in which the learning rate rises; 5 of 125 epochs in the thesis.
     warmup_fraction: float = 0.04
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
@@ -27,7 +24,7 @@ class LinearWarmupDecaySchedulerConfig(LRSchedulerConfig):
             warmup = round(self.warmup_fraction * total)
 
         def factor(step: int) -> float:
-            """Update 0 already moves (1 / warmup); the peak is update `warmup`, update `total` would be 0."""
+            """1 / (warmup + 1) at update 0, 1 at update `warmup`, 0 after the last update."""
             rise = (step + 1) / (warmup + 1)
             fall = (total - step) / max(total - warmup, 1)
             return max(0.0, min(rise, fall, 1.0))

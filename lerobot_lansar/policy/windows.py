@@ -1,23 +1,20 @@
-"""Training windows: which steps of which demonstration the network sees for a sampled frame, and what it
-should predict.
+"""Training windows: which steps of which demonstration a sampled frame stands for, and what is to be predicted there.
 
-LeRobot samples every frame of every episode once per epoch, in random order. Here a sampled frame stands for
-a window of at most n = `window` steps, chosen by a fixed rule, so that a run can be resumed and a validation
-loss compared:
+LeRobot samples every frame of every episode once per epoch, in random order. Here each sampled frame stands for a
+window of at most n = `window` steps. A fixed rule says which, so that a resumed run sees the same windows and
+validation losses are comparable:
 
-* "episode": the demonstration from its start (thesis). Of a demonstration longer than n, frame j stands for
-  the window that starts at j * (L - n) / (L - 1): every start equally often, the first and the last n steps
-  included.
-* "anywhere": from the sampled frame on, at most n steps, up to the demonstration's end. Step k of a
-  demonstration is then in min(k + 1, n) windows, with every history length equally often: it learns to act on
-  short histories everywhere, which is what it meets at inference after the history was cleared.
-* "mixed": frames with an even index by the first rule, odd ones by the second.
+* "episode": the demonstration from its start (thesis). If it is longer than n, frame j stands for the window that
+  starts at j * (L - n) / (L - 1): every start occurs equally often, and the first and last n steps are included.
+* "anywhere": at most n steps from the sampled frame, up to the demonstration's end. Step k of a demonstration is then
+  in min(k + 1, n) windows, once with each history length, so the network learns to act on short histories
+  everywhere: that is its situation at inference after the history was cleared.
+* "mixed": frames with an even index by the first rule, those with an odd index by the second.
 
-A demonstration of L frames is therefore seen L times per epoch, long ones more often than short ones.
+A demonstration of L frames is thus seen L times per epoch, long ones more often than short ones.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,14 +22,12 @@ from torch import Tensor
 
 from ..calvin import ACTION_NAMES, POSE_UNITS, TCP_POSE, wrap_angle
 from ..clip.store import load_embeddings
-from .frames import load_frames, load_sentences, paraphrases
-
-if TYPE_CHECKING:
-    from .configuration_lansar import LanSARConfig
+from .configuration_lansar import LanSARConfig
+from .frames import find_paraphrases, load_frames, load_sentence_tasks
 
 
 def action_form(features: dict) -> str:
-    """Whether a dataset's `action` is relative ("rel") or absolute ("abs"), told by its names.
+    """Whether a dataset's `action` is relative ("rel") or absolute ("abs"), as its names say.
 
     Raises:
         ValueError: The names are neither.
@@ -42,31 +37,30 @@ def action_form(features: dict) -> str:
         if names is not None and tuple(names) == expected:
             return form
     raise ValueError(
-        f"The dataset's action is named {names}; LanSAR must know whether it is relative "
-        f"{list(ACTION_NAMES['rel'])} or absolute {list(ACTION_NAMES['abs'])}. Datasets made by lansar-convert say so."
+        f"The dataset's action has the names {names}; LanSAR expects relative actions, {list(ACTION_NAMES['rel'])}, or "
+        f"absolute ones, {list(ACTION_NAMES['abs'])}, as lansar-convert names them."
     )
 
 
-def motion_targets(frames: dict[str, np.ndarray], form: str, target: str) -> np.ndarray:
+def make_targets(frames: dict[str, np.ndarray], form: str, target: str) -> np.ndarray:
     """What the network should predict at every frame (thesis section 4.2, Eq 4.3-4.5).
 
     Args:
         frames: From `load_frames`.
-        form: "rel" or "abs", what the recorded action is.
-        target: "commanded": where the action wants the TCP minus where it is; a relative action is exactly
-            that, in units of (0.02 m, 0.05 rad). "achieved": where the TCP is one frame later minus where it
-            is; nothing for an episode's last frame, whose row is meaningless.
+        form: "rel" or "abs", the recorded action's form.
+        target: "commanded": the pose that the action commands minus the current pose; a relative action is this
+            difference already, in units of (0.02 m, 0.05 rad). "achieved": the pose one frame later minus the current
+            pose; meaningless in an episode's last frame.
 
     Returns:
-        (T, 7) float32: position (m), orientation (rad, wrapped to [-pi, pi)), gripper command 0 close / 1
-        open.
+        (T, 7) float32: position (m), orientation (rad, wrapped to [-pi, pi)), gripper command 0 close / 1 open.
     """
     pose = frames["state"][:, TCP_POSE].astype(np.float64)
     action = frames["action"].astype(np.float64)
     if target == "achieved":
         delta = np.roll(pose, -1, axis=0) - pose
     elif form == "abs":
-        delta = action[:, :6] - pose
+        delta = action[:, TCP_POSE] - pose
     else:
         delta = action[:, :6] * POSE_UNITS
     delta[:, 3:] = wrap_angle(delta[:, 3:])
@@ -84,27 +78,26 @@ class Windows:
 
     Attributes:
         frames: The arrays of `load_frames`.
-        targets: (T, 7) from `motion_targets`.
+        targets: (T, 7) from `make_targets`.
         has_target: (T,) bool, False for an episode's last frame with achieved targets.
-        embeddings: {"static", "gripper"} (total_frames, D), empty without `use_images`.
-        clip_info: Clip.json's contents, empty without `use_images`.
+        embeddings: {"static", "gripper"}: (total_frames, D), empty without `use_images`.
+        clip_info: The contents of clip.json, empty without `use_images`.
         clip: The policy's choice of CLIP.
-        asked: The CALVIN tasks that each command asks for; empty unless `paraphrases` or the contrastive loss need
-            them.
+        sentence_tasks: The CALVIN tasks that each sentence can mean; empty unless `paraphrases` or the contrastive
+            loss need them.
 
     Raises:
         ValueError, FileNotFoundError: The dataset cannot be used; the message says why and what to do.
     """
 
-    def __init__(self, root: Path, features: dict, total_frames: int, config: "LanSARConfig") -> None:
+    def __init__(self, root: Path, features: dict, total_frames: int, config: LanSARConfig) -> None:
         self.length, self.rule = config.window, config.window_start
         form = action_form(features)
         self.frames = load_frames(root)
-        self.targets = motion_targets(self.frames, form, config.target)
-        rows = np.arange(len(self.targets))
-        self.has_target: np.ndarray = np.ones(len(rows), dtype=bool)
+        self.targets = make_targets(self.frames, form, config.target)
+        self.has_target: np.ndarray = np.ones(len(self.targets), dtype=bool)
         if config.target == "achieved":
-            self.has_target = rows < self.frames["end"] - 1
+            self.has_target = np.arange(len(self.targets)) < self.frames["end"] - 1
             if (self.frames["end"] - self.frames["first"] < 2).any():
                 raise ValueError("--policy.target=achieved needs episodes of at least two frames; one is shorter.")
         self.clip = config.clip
@@ -116,23 +109,26 @@ class Windows:
         self.embeddings: dict[str, np.ndarray | Tensor] = {}
         self.clip_info: dict = {}
         if config.use_images:
-            embeddings, self.clip_info = load_embeddings(root, total_frames)
-            self.embeddings.update(embeddings)
-            named = (self.clip_info["model"], self.clip_info["embed_dim"])
-            if named != (config.clip.model, config.network.clip_dim):
-                raise ValueError(
-                    f"The dataset's pictures were embedded with CLIP {named[0]} ({named[1]} numbers), the "
-                    f"policy is set to {config.clip.model} ({config.network.clip_dim}). Set "
-                    "--policy.clip.model and --policy.clip.pretrained to those of the conversion, or convert "
-                    "the dataset again."
-                )
+            self._load_embeddings(root, total_frames, config)
         self.paraphrases = config.paraphrases
-        self.asked = load_sentences(root) if config.paraphrases or config.contrastive_weight else {}
-        self._choices = paraphrases(self.asked)
-        known = sorted(set[int]().union(*self.asked.values()))
-        self._names = {s: [float(task in tasks) for task in known] for s, tasks in self.asked.items()}
+        needed = config.paraphrases or config.contrastive_weight
+        self.sentence_tasks = load_sentence_tasks(root) if needed else {}
+        self._paraphrases_of = find_paraphrases(self.sentence_tasks)
+        known = sorted(set[int]().union(*self.sentence_tasks.values()))
+        self._task_rows = {s: [float(task in tasks) for task in known] for s, tasks in self.sentence_tasks.items()}
         self.device = torch.device(config.device or "cpu")
         self._move_to_gpu()
+
+    def _load_embeddings(self, root: Path, total_frames: int, config: LanSARConfig) -> None:
+        embeddings, self.clip_info = load_embeddings(root, total_frames)
+        self.embeddings.update(embeddings)
+        model, size = self.clip_info["model"], self.clip_info["embed_dim"]
+        if (model, size) != (config.clip.model, config.network.clip_dim):
+            raise ValueError(
+                f"The dataset's pictures were embedded with CLIP {model} ({size} numbers), the policy is set to "
+                f"{config.clip.model} ({config.network.clip_dim}). Set --policy.clip.model and "
+                "--policy.clip.pretrained to those of the conversion, or convert the dataset again."
+            )
 
     def bounds(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows [start, end) of the windows that sampled frames stand for.
@@ -141,14 +137,14 @@ class Windows:
             index: (B,) absolute frame numbers.
 
         Raises:
-            IndexError: A number the dataset does not have.
+            IndexError: The dataset has no frame of such a number.
         """
         known = self.frames["index"]
         row = np.searchsorted(known, index)
         if (row >= len(known)).any() or (known[np.minimum(row, len(known) - 1)] != index).any():
             raise IndexError("The batch holds a frame index that the dataset's parquet files do not have.")
         first, end = self.frames["first"][row], self.frames["end"][row]
-        end = end - ~self.has_target[end - 1]  # a last frame without target is no step of any window
+        end = end - ~self.has_target[end - 1]  # a last frame without target belongs to no window
         spare = np.maximum(end - first - self.length, 0)
         spread = first + np.rint((row - first) * spare / np.maximum(end - first - 1, 1)).astype(np.int64)
         spread = np.minimum(spread, first + spare)
@@ -164,42 +160,41 @@ class Windows:
             index: (B,) absolute frame numbers.
 
         Returns:
-            State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) float32, valid_steps (N,) int64, the
-            places of the steps that are no padding among the B * n, and with `use_images` static and gripper
-            (B, n, D) float32. Padded steps repeat the window's last step. On a GPU if the frames fit there.
+            State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) and, with `use_images`, static and gripper
+            (B, n, D), all float32; valid_steps (N,) int64, which of the B * n steps are not padding. Padding repeats
+            the window's last step. On the GPU if the frames fit there.
         """
         start, end = self.bounds(index)
-        rows = start[:, None] + np.arange((end - start).max())
-        valid = np.flatnonzero(rows < end[:, None])
+        rows = start[:, None] + np.arange((end - start).max())  # (B, n)
+        valid_steps = np.flatnonzero(rows < end[:, None])
         rows = np.minimum(rows, end[:, None] - 1)
-        places = {"rows": rows, "embeddings": self.frames["index"][rows] if self.embeddings else rows}
+        frame_rows, embedding_rows = rows, self.frames["index"][rows] if self.embeddings else rows
         if self.on_gpu:
-            places = {name: torch.from_numpy(value).to(self.device) for name, value in places.items()}
-        out = {name: array[places["rows"]] for name, array in self.arrays.items()}
-        out |= {name: array[places["embeddings"]] for name, array in self.embeddings.items()}
-        return {name: torch.as_tensor(value).float() for name, value in out.items()} | {
-            "valid_steps": torch.from_numpy(valid)
-        }
+            frame_rows, embedding_rows = (torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows))
+        found = {name: array[frame_rows] for name, array in self.arrays.items()}
+        found |= {name: array[embedding_rows] for name, array in self.embeddings.items()}
+        window = {name: torch.as_tensor(values).float() for name, values in found.items()}
+        return window | {"valid_steps": torch.from_numpy(valid_steps)}
 
-    def say(self, tasks: list[str]) -> list[str]:
-        """The commands of a batch, with `paraphrases` in random words (from torch's generator).
+    def paraphrase(self, commands: list[str]) -> list[str]:
+        """The commands of a batch, with `paraphrases` each in random words (drawn from torch's generator).
 
-        Not where no gradient is asked for: held-out losses are to be compared.
+        Skipped under no_grad, so held-out losses stay comparable.
         """
         if not self.paraphrases or not torch.is_grad_enabled():
-            return tasks
-        choices = [self._choices.get(task, [task]) for task in tasks]
+            return commands
+        choices = [self._paraphrases_of.get(command, [command]) for command in commands]
         draws = torch.rand(len(choices)).tolist()
-        return [listed[int(draw * len(listed))] for listed, draw in zip(choices, draws, strict=True)]
+        return [sentences[int(draw * len(sentences))] for sentences, draw in zip(choices, draws, strict=True)]
 
-    def groups(self, tasks: list[str]) -> Tensor | None:
-        """(B, tasks) float32, 1 for the CALVIN tasks that each command asks for; None where nothing needs it."""
-        if not self.asked:
+    def command_tasks(self, commands: list[str]) -> Tensor | None:
+        """(B, tasks) float32, 1 for the CALVIN tasks that each command can mean; None where nothing needs them."""
+        if not self.sentence_tasks:
             return None
-        return torch.tensor([self._names[task] for task in tasks])
+        return torch.tensor([self._task_rows[command] for command in commands])
 
     def _move_to_gpu(self) -> None:
-        """The arrays onto the GPU if they take at most half of what is free there: lookups then cost no transfer."""
+        """Moves the arrays to the GPU if they take at most half of its free memory: lookups then need no transfer."""
         size = sum(array.nbytes for array in (*self.arrays.values(), *self.embeddings.values()))
         self.on_gpu = self.device.type == "cuda" and size <= torch.cuda.mem_get_info(self.device)[0] / 2
         if self.on_gpu:
@@ -212,15 +207,13 @@ _current: list[Windows] = []
 
 
 def set_current(windows: Windows) -> None:
-    """Called by a policy built for training; the window step made right after it takes them from
-    `get_current`.
+    """Makes `windows` those of the next `WindowStep`; called by a policy built for training.
 
-    LeRobot gives the dataset's folder to the policy only, and rebuilds a checkpoint's pipeline from JSON
-    alone.
+    LeRobot tells only the policy where the dataset is, and rebuilds a checkpoint's pipeline from JSON alone.
     """
     _current[:] = [windows]
 
 
 def get_current() -> Windows | None:
-    """The windows of the policy built last for training, None in an evaluation."""
+    """The windows of the policy that was last built for training; None in an evaluation."""
     return _current[0] if _current else None

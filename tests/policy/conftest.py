@@ -36,6 +36,14 @@ def small_config(**options):
     return LanSARConfig(**{**SMALL, "clip": ClipConfig("lansar-tiny", ""), **options})
 
 
+def thesis_network(**options):
+    """The NetworkConfig of the thesis' baseline, with changed options of LanSARConfig."""
+    from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+
+    thesis = {"orientation": "euler", "egocentric_blocks": False, "command_in_context": False}
+    return LanSARConfig(**{"device": "cpu", **thesis, **options}).network
+
+
 def smooth_episode(rng: np.random.Generator, length: int) -> dict[str, np.ndarray]:
     """State (15), environment state (24), absolute and relative action (7) of one episode."""
     steps = np.arange(length)
@@ -66,7 +74,7 @@ def make_dataset(
 ):
     """Write a LeRobotDataset without pictures; returns the episodes' arrays.
 
-    With `shown`, the number of each episode's CALVIN task and its sentence, it has the column calvin.task.
+    With `shown`, the number of each episode's CALVIN task and its sentence, the dataset has the column calvin.task.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 

@@ -1,4 +1,4 @@
-"""The network alone: what it computes, what it may see, and what each ablation really removes."""
+"""The network alone: what it computes, what each token may see, and what each ablation removes."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -7,19 +7,20 @@ import pytest
 import torch
 from torch import nn
 
+from lerobot_lansar.clip.model import ClipConfig
 from lerobot_lansar.policy.network import (
     Attention,
     BatchNorm,
-    DecoderCache,
     DecoderLayer,
     EncoderLayer,
     LanSARNetwork,
-    NetworkConfig,
     recorded_attention,
 )
 
-TINY = NetworkConfig(
-    clip_dim=12,
+from .conftest import thesis_network
+
+TINY = thesis_network(
+    clip=ClipConfig("lansar-tiny", ""),
     hidden=24,
     context_layers=2,
     context_heads=2,
@@ -28,9 +29,7 @@ TINY = NetworkConfig(
     feedforward=32,
     window=8,
 )
-
-
-THESIS = NetworkConfig()
+THESIS = thesis_network()
 at_both_sizes = pytest.mark.parametrize("size", [TINY, THESIS], ids=["tiny", "thesis"])
 
 
@@ -47,7 +46,7 @@ def windows(config, lengths, seed=0):
         "state": draw(rows, steps, config.state_dim),
         "blocks": draw(rows, steps, 3, config.block_dim),
         "scene": draw(rows, steps, config.scene_dim),
-        "rows": torch.cat([i * steps + torch.arange(length) for i, length in enumerate(lengths)]),
+        "valid_steps": torch.cat([i * steps + torch.arange(length) for i, length in enumerate(lengths)]),
         "static": draw(rows, steps, config.clip_dim),
         "gripper": draw(rows, steps, config.clip_dim),
     }
@@ -140,7 +139,7 @@ def test_padding_changes_nothing_in_training_mode_either(size, norm):
     for name in ("state", "blocks", "scene", "static", "gripper"):
         pad = torch.zeros_like(longer[name][:, :2])
         longer[name] = torch.cat([longer[name], pad], dim=1)
-    longer["rows"] = torch.tensor([0, 1, 2, 3, 4, 5, 8, 9, 10])
+    longer["valid_steps"] = torch.tensor([0, 1, 2, 3, 4, 5, 8, 9, 10])
     torch.testing.assert_close(network(**longer)[0], motion, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(network(**longer)[1], logit, rtol=1e-4, atol=1e-5)
 
@@ -168,7 +167,7 @@ def test_a_context_sees_the_command_only_when_asked_to():
         network = build(command_in_context=in_context).eval()
         command = torch.randn(4, TINY.hidden, requires_grad=True)
         names = ("state", "blocks", "scene", "static", "gripper")
-        context = network.encode_context(network.modalities(*(inputs[name][0] for name in names)), command)
+        context = network.encode_context(network.encode_modalities(*(inputs[name][0] for name in names)), command)
         (gradient,) = torch.autograd.grad(context.sum(), command, allow_unused=True)
         assert (gradient is not None) == in_context == ("C" in network.context_tokens)
 
@@ -177,7 +176,9 @@ def test_the_command_decides_which_block_a_single_context_layer_looks_at():
     inputs = windows(TINY, [1])
     for in_context in (False, True):
         network = build(command_in_context=in_context, context_layers=1).eval()
-        tokens = network.modalities(*(inputs[name][0] for name in ("state", "blocks", "scene", "static", "gripper")))
+        tokens = network.encode_modalities(
+            *(inputs[name][0] for name in ("state", "blocks", "scene", "static", "gripper"))
+        )
         shares = []
         for command in torch.randn(2, 1, TINY.hidden):
             with recorded_attention(network.context_layers) as seen:
@@ -191,7 +192,7 @@ def test_the_command_decides_which_block_a_single_context_layer_looks_at():
 def test_a_prepended_command_stands_once_at_the_front():
     steps, command = torch.ones(1, 3, TINY.hidden), torch.zeros(1, TINY.hidden)
     kinds = {
-        prepended: build(command_prepended=prepended)._with_command(steps, command)[0, :, 0].tolist()
+        prepended: build(command_prepended=prepended)._add_command(steps, command)[0, :, 0].tolist()
         for prepended in (False, True)
     }
     assert kinds == {False: [0, 1, 0, 1, 0, 1], True: [0, 1, 1, 1]}
@@ -211,7 +212,7 @@ def test_the_thesis_size_has_the_parameters_table_4_2_implies():
     expected += mlp(h, 256, 64, 6, last=False) + mlp(h, 256, 64, 1, last=False)
     expected += 6 * (attention + mixing + 2 * norm) + 6 * (2 * attention + mixing + 3 * norm)
     expected += h + 8 * h + 2 * 128 * h  # CLS, modality positions, memory and target positions
-    network = LanSARNetwork(NetworkConfig())
+    network = LanSARNetwork(THESIS)
     assert sum(p.numel() for p in network.parameters()) == expected
     assert expected == 46_811_811  # docs/lansar.md
 
@@ -247,7 +248,7 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
     assert all(not module.weights for module in network.modules() if isinstance(module, Attention))
     assert {name: [tuple(w.shape) for w in calls] for name, calls in context.items()} == {
         "0.attention": [(5, 2, 8, 8)],
-        "1.attention": [(5, 2, 1, 8)],  # only CLS is read of the last layer
+        "1.attention": [(5, 2, 1, 8)],  # only CLS is read in the last layer
     }
     (weights,) = decoder["1.cross_attention"]
     assert weights.shape == (1, 2, 10, 10)
@@ -256,11 +257,11 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
 
     attention = network.decoder_layers[0].self_attention
     x, memory = torch.randn(2, 1, 6, TINY.hidden)
-    cache = DecoderCache(network.config, 1, x)
-    for decoded in (slice(0, 4), slice(4, 6)):  # of the cache: four tokens, then two that see these
-        past = cache.add([0], (decoded.stop - decoded.start) // 2)
+    cache = network.new_cache(1)
+    for decoded in (slice(0, 4), slice(4, 6)):  # with the cache: four tokens, then two that also see these
+        view = cache.add([0], (decoded.stop - decoded.start) // 2)
         attention.weights = []
-        out = attention(x[:, decoded], memory[:, decoded], past=past)
+        out = attention(x[:, decoded], memory[:, decoded], cache=view)
         values = attention.value(memory[:, : decoded.stop]).unflatten(-1, (2, -1)).transpose(1, 2)
         mixed = (attention.weights[0] @ values).transpose(1, 2).flatten(2)
         torch.testing.assert_close(attention.out(mixed), out)
@@ -271,7 +272,7 @@ def test_recorded_attention_is_what_makes_the_output_and_costs_nothing_otherwise
 def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
     network = build(contrastive=True).eval()
     inputs = windows(TINY, [4, 6, 3, 5])
-    inputs["group"] = torch.eye(3)[[0, 1, 2, 0]]  # two windows of one task
+    inputs["command_tasks"] = torch.eye(3)[[0, 1, 2, 0]]  # two windows of one task
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     losses = []
     for _ in range(60):
@@ -286,30 +287,30 @@ def test_the_contrastive_loss_falls_when_windows_and_their_commands_agree():
     assert build()(**windows(TINY, [4]))[2] is None
 
 
-def test_the_contrastive_loss_holds_no_two_commands_apart_that_share_a_task():
+def test_commands_that_share_a_task_are_no_negatives_in_the_contrastive_loss():
     network = build(contrastive=True).eval()
     inputs = windows(TINY, [4, 6, 5])
-    inputs["group"] = torch.tensor([[1.0, 0], [1, 1], [0, 0]])  # red, "lift it", none
-    logits = []
+    inputs["command_tasks"] = torch.tensor([[1.0, 0], [1, 1], [0, 0]])  # red, "lift it", none
+    seen = []
     cross_entropy = torch.nn.functional.cross_entropy
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             torch.nn.functional,
             "cross_entropy",
-            lambda x, goal: logits.append(goal) or cross_entropy(x, goal),
+            lambda x, labels: seen.append(labels) or cross_entropy(x, labels),
         )
         network(**inputs)
-    for goal in logits:
-        assert goal.tolist() == [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]]
+    for labels in seen:
+        assert labels.tolist() == [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]]
 
 
-def test_no_forward_or_backward_pass_waits_for_a_gpu_to_tell_a_number():
-    """PyTorch's fake tensors have no values: what asks for one (an item, a mask's count) raises."""
+def test_neither_forward_nor_backward_pass_synchronises_a_gpu():
+    """PyTorch's fake tensors have no values: reading one (an item, a mask's count) raises."""
     from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 
     with FakeTensorMode():
         network = build(contrastive=True, command_in_context=True).train()
-        inputs = windows(TINY, [6, 3]) | {"group": torch.ones(2, 4)}
+        inputs = windows(TINY, [6, 3]) | {"command_tasks": torch.ones(2, 4)}
         motion, logit, contrast = network(**inputs)
         (motion.sum() + logit.sum() + contrast).backward()
         assert motion.shape == (9, 6)
@@ -320,7 +321,7 @@ def test_no_forward_or_backward_pass_waits_for_a_gpu_to_tell_a_number():
 @pytest.mark.parametrize("where", ["padding", "batch"])
 def test_the_contrastive_loss_describes_a_window_by_its_own_steps(where):
     network = build(contrastive=True).eval()
-    inputs = windows(TINY, [4, 6]) | {"group": torch.eye(2)}
+    inputs = windows(TINY, [4, 6]) | {"command_tasks": torch.eye(2)}
     before = network(**inputs)[2]
     other = {name: value.clone() for name, value in inputs.items()}
     if where == "padding":

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from draccus.wrappers import docstring
 from torch import nn
 
 from lerobot_lansar.clip.model import Clip, ClipConfig, embedding_size
@@ -69,16 +70,16 @@ def test_the_loss_is_eq_4_6_on_scaled_targets_over_valid_steps(relative):
     batch = preprocess(sampled_frames(0, 25, 115))
     loss, parts = policy.forward(batch)
 
-    rows = batch["valid_steps"]
-    assert rows.tolist() == [*range(20), *range(64, 128), *range(128, 132)]
+    valid_steps = batch["valid_steps"]
+    assert valid_steps.tolist() == [*range(20), *range(64, 128), *range(128, 132)]
     x, blocks, scene = policy.scaler.encode(batch["observation.state"], batch["observation.environment_state"])
-    motion, logit, _ = policy.network(batch["observation.clip.command"], x, blocks, scene, rows)
-    goal = batch["action"].reshape(-1, 7)[rows]
-    true = (goal[:, :6] - policy.scaler.delta_mean) / policy.scaler.delta_std
+    motion, logit, _ = policy.network(batch["observation.clip.command"], x, blocks, scene, valid_steps)
+    target = batch["action"].reshape(-1, 7)[valid_steps]
+    true = (target[:, :6] - policy.scaler.delta_mean) / policy.scaler.delta_std
     error = (motion - true).abs()
     smooth = torch.where(error < 0.1, 0.5 * error**2 / 0.1, error - 0.05)
     probability = torch.sigmoid(logit)
-    cross_entropy = -(goal[:, 6] * probability.log() + (1 - goal[:, 6]) * (1 - probability).log()).mean()
+    cross_entropy = -(target[:, 6] * probability.log() + (1 - target[:, 6]) * (1 - probability).log()).mean()
     expected = smooth[:, :3].mean() + smooth[:, 3:].mean() + cross_entropy
     torch.testing.assert_close(loss, expected)
     assert sum(dict(parts.items()).values()) == pytest.approx(loss.item(), rel=1e-5)
@@ -247,6 +248,15 @@ def test_impossible_options_are_refused_with_the_option_named():
         small_config(use_images=False, use_spatial_context=False)
     with pytest.raises(ValueError, match=r"--policy.clip.model='nope'"):
         LanSARPolicy(small_config(clip=ClipConfig("nope", "")))
+
+
+@pytest.mark.parametrize("options", [LanSARConfig, ClipConfig, LinearWarmupDecaySchedulerConfig])
+def test_every_option_is_explained_by_help(options):
+    """draccus takes the text from the comment above the field; argparse would trip over a percent sign in it."""
+    for name in options.__annotations__:
+        text = docstring.get_preferred_help_text(docstring.get_attribute_docstring(options, name))
+        assert text, name
+        assert "%" not in text, name
 
 
 def test_missing_features_are_named():
@@ -422,6 +432,6 @@ def test_options_of_training_change_training_only(tmp_path):
         loss, parts = policy.forward(batch)
         assert loss == policy.forward(batch)[0]
     assert torch.equal(torch.get_rng_state(), generator)  # a held-out loss draws nothing
-    assert batch["command_group"].tolist() == np.eye(len(COMMANDS))[:3].tolist()
+    assert batch["command_tasks"].tolist() == np.eye(len(COMMANDS))[:3].tolist()
     weights = {"contrastive_loss": 0.5}
     assert sum(weights.get(k, 1) * v for k, v in parts.items()) == pytest.approx(loss.item(), rel=1e-5)

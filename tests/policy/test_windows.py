@@ -253,7 +253,7 @@ def test_wrapping_goes_to_minus_pi_exclusive_pi_inclusive():
     assert wrap_angle(torch.tensor(math.pi, dtype=torch.float64)) == -math.pi
 
 
-def test_paraphrases_say_the_same_task_in_other_words(tmp_path):
+def test_a_paraphrase_means_the_same_tasks(tmp_path):
     plain, root = tmp_path / "plain", tmp_path / "data"
     make_dataset(plain)
     with pytest.raises(ValueError, match=r"has no column calvin\.task"):
@@ -264,11 +264,11 @@ def test_paraphrases_say_the_same_task_in_other_words(tmp_path):
     make_dataset(root, lengths=(5,) * len(shown), shown=tuple(shown))
     windows = make_windows(root, paraphrases=True)
     torch.manual_seed(0)
-    said = windows.say(["open the drawer"] * 50 + ["lift the red block"] * 50 + ["lift it"] * 5)
+    said = windows.paraphrase(["open the drawer"] * 50 + ["lift the red block"] * 50 + ["lift it"] * 5)
     assert set(said[:50]) == set(opening)
     assert set(said[50:100]) == set(lifting)
-    assert set(said[100:]) == {"lift it"}  # of two tasks: only what fits both
-    assert make_windows(root).say(["anything"]) == ["anything"]
-    together = windows.groups(["pull the drawer", "lift it", "lift the red block", "play"])
+    assert set(said[100:]) == {"lift it"}  # means two tasks: only sentences that mean both
+    assert make_windows(root).paraphrase(["anything"]) == ["anything"]
+    together = windows.command_tasks(["pull the drawer", "lift it", "lift the red block", "play"])
     shares_a_task = together @ together.T > 0
     assert shares_a_task.tolist() == [[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
