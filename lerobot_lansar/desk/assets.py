@@ -73,7 +73,7 @@ def _original(scene: Scene, folder: Path) -> Assets:
 
 
 def _check(file: Path, scene: Scene) -> None:
-    """Refuses what Bullet would load without a word: a missing texture, and a Git LFS pointer as an empty mesh."""
+    """Refuses files of which Bullet would not complain: missing textures, and Git LFS pointers (as empty meshes)."""
     if not file.is_file():
         raise DeskError(
             f"asset file {file} is missing; assets must name the `data` folder of a calvin_env checkout "

@@ -133,7 +133,7 @@ class Desk:
                 hand open.
             scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks at random
                 as in CALVIN, or where the scene's layout puts them.
-            seed: Determines the blocks' random poses; None: other ones every time.
+            seed: Determines the blocks' random poses; None: different ones every time.
 
         Returns:
             The observation after one simulation step, as in CALVIN.

@@ -28,6 +28,7 @@ DOOR_WIDTH = 0.28
 DRAWER_TRAVEL = 0.22
 SWITCH_TRAVEL = 0.088
 BUTTON_TRAVEL = 0.02
+"""Upper limits of three joints in every scene (m)."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ EVALUATION_LAYOUT: dict[str, tuple[float, ...]] = {
 
 
 def beside_door(scene: Scene, slide: float, x: float) -> bool:
-    """Whether a finger fits between the door's edge and a block whose middle is at `x` in the cabinet: 0.045 m."""
+    """Whether a finger, 0.045 m from the block's middle, fits between the door's edge and a block at `x` behind it."""
     door = scene.slide_x - slide
     return bool(x < door - 0.045 or x > door + DOOR_WIDTH + 0.045)
 

@@ -1,4 +1,4 @@
-"""Random start states in which a given task can be carried out, for single-task episodes and demonstrations."""
+"""Random start states in which a given task is feasible, for single-task episodes and demonstrations."""
 
 import itertools
 
@@ -161,7 +161,7 @@ def _blocks(
 
 
 def _on(scene: Scene, place: str, rng: np.random.Generator) -> np.ndarray:
-    """A block pose (6,) in the drawer, on the table behind the drawer's edge, or in one of the scene's areas."""
+    """A block pose (6,) in the drawer, on the table close to it (`drawer_edge`), or in one of the scene's areas."""
     yaw = np.pi / 2 + rng.uniform(-np.pi / 8, np.pi / 8)
     if place == "drawer":
         xyz = [scene.drawer_x + rng.uniform(-0.11, 0.11), rng.uniform(-0.32, -0.25), DRAWER_Z]

@@ -1,4 +1,4 @@
-"""The built-in desk: what a user may rely on without any asset files."""
+"""The built-in desk: what users can rely on without any asset files."""
 
 import numpy as np
 import pytest

@@ -73,7 +73,7 @@ def test_a_thousand_other_episodes_leave_nothing_behind(desk):
     np.testing.assert_array_equal(motion(desk), first)
 
 
-def test_a_saved_state_can_be_gone_back_to_even_on_another_desk(desk):
+def test_a_saved_state_can_be_restored_even_on_another_desk(desk):
     motion(desk, steps=40)
     state = desk.save()
     actions = np.random.default_rng(3).uniform(-1, 1, (40, 7))
@@ -127,7 +127,7 @@ def test_drawing_does_not_change_the_motion(desk, monkeypatch):
     np.testing.assert_array_equal(motion(desk), fresh)
 
 
-def test_a_diverging_simulation_is_an_error_and_a_reset_mends_it(desk):
+def test_a_diverging_simulation_is_an_error_and_a_reset_repairs_it(desk):
     with Desk("D", cameras=()) as neighbour:
         before = motion(desk, steps=5)
         desk.reset(seed=0)
@@ -146,7 +146,7 @@ def resident() -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="measures memory as Linux tells it")
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads this process's memory from Linux's /proc")
 def test_ten_thousand_episodes_and_a_hundred_desks_leak_nothing(desk):
     def episode(seed):
         desk.reset(seed=seed % 50)
@@ -166,7 +166,7 @@ def test_ten_thousand_episodes_and_a_hundred_desks_leak_nothing(desk):
         other.reset()
     gc.collect()
     before = resident()
-    for _ in range(100):  # Bullet has room for 1024 clients, and not for many that are never given back
+    for _ in range(100):  # Bullet has room for 1024 clients, so desks must give theirs back
         with Desk("D") as other:
             other.reset()
     gc.collect()

@@ -62,7 +62,7 @@ def egl():
         pytest.skip(str(error))
 
 
-def test_without_a_driver_egl_is_an_error_and_not_the_end():
+def test_without_a_driver_egl_is_an_error_and_not_a_crash():
     code = (
         "from lerobot_lansar.desk import Desk, DeskError\n"
         "try: Desk('D', renderer='egl')\n"
@@ -97,7 +97,7 @@ def test_fast_gl_draws_what_the_egl_plugin_once_drew():
             assert np.abs(desk.render(camera) - expected).mean() < bound
 
 
-def test_lights_and_any_size():
+def test_lights_change_the_picture_at_any_size():
     with Desk("D", cameras=()) as desk:
         off = desk.reset(seed=0)["scene_obs"]
         dark = desk.render("static", 64)

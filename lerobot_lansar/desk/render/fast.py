@@ -41,7 +41,7 @@ class FastRenderer:
         self._vertices = np.ascontiguousarray(np.concatenate([mesh.vertices for mesh in meshes]).T)
         self._faces = np.concatenate(
             [mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts[:-1], strict=True)]
-        ).astype(np.uint32)  # unsigned: numba need not look out for negative indices
+        ).astype(np.uint32)  # unsigned: numba need not check for negative indices
         self._normals = np.concatenate([mesh.normals for mesh in meshes]).astype(np.float32)
         self._uvs = np.concatenate([mesh.uvs for mesh in meshes]).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(mesh.faces) for mesh in meshes])
@@ -62,8 +62,8 @@ class FastRenderer:
             intrinsics: Field of view and clip planes.
             view: (4, 4) world to eye.
             size: Pixels per side.
-            colors: (body, link) to rgba where it is not the body's own.
-            fixed: The camera never moves, so what never moves is drawn only once.
+            colors: Rgba of repainted links, by (body, link).
+            fixed: Whether the camera never moves; then bodies that never move either are drawn only once.
 
         Returns:
             Picture (size, size, 3) uint8, and inverse depth (size, size) float32: 1 / distance along the view axis

@@ -11,7 +11,7 @@ from .stage import Stage
 LIGHT = np.array([-5.0, -40.0, 200.0])
 """Position of the EGL plugin's light, m."""
 HIGHLIGHT_EYE = 20 * np.array([np.sin(np.radians(20)), -np.cos(np.radians(20)), 0.0])
-"""Position of the camera for which the plugin computes highlights, m: its window's, not the one that is drawn for."""
+"""Position of the camera for which the plugin computes highlights, m: always that of its own window."""
 BACKGROUND = (179, 179, 204)
 
 TEXELS_PER_METRE = 4096 / 20

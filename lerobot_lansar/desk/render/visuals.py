@@ -16,8 +16,8 @@ from trimesh.exchange.stl import HeaderError, load_stl_binary
 
 from ..errors import DeskError
 
-_CYLINDER_SIDES = 32  # Bullet draws a cylinder as a prism, of whose corners it keeps one per direction of _directions
-_MARGIN = 0.001  # and adds this much all around (m)
+_CYLINDER_SIDES = 32  # Bullet draws a cylinder as a prism, keeps one of its corners for each of _directions ...
+_MARGIN = 0.001  # ... and moves it outwards by this (m)
 
 
 @dataclass(frozen=True)
