@@ -102,6 +102,23 @@ def wrap_angle[Angles](angle: Angles) -> Angles:
     return (angle + np.pi) % (2 * np.pi) - np.pi  # type: ignore[operator, return-value]
 
 
+HOME_EULER = np.array([np.pi, 0.0, np.pi / 2])
+"""Euler angles (rad) of a hand at rest: it points down, and the gripper camera looks at the cabinet."""
+HOME_EULER.flags.writeable = False
+
+
+def continuous_euler(euler: np.ndarray) -> np.ndarray:
+    """Euler angles (..., 3) within half a turn of `HOME_EULER`: roll in [0, 2 pi), pitch in [-pi, pi), yaw in
+    [-pi/2, 3 pi/2).
+
+    CALVIN's own angles jump from pi to -pi, and the roll of a hand that points down lies exactly there. Datasets
+    written here and the environment's observation have these angles instead, in states and in absolute actions alike,
+    so that no pose that the arm reaches jumps. Angles that need no change keep every bit.
+    """
+    turns = np.floor((euler - (HOME_EULER - np.pi)) / (2 * np.pi))
+    return (euler - 2 * np.pi * turns).astype(euler.dtype)
+
+
 def relative_action(action: np.ndarray, robot_obs: np.ndarray) -> np.ndarray:
     """The relative form of absolute actions, as the simulator defines it.
 
