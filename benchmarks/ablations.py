@@ -1,4 +1,4 @@
-r"""Which of LanSAR's options earn their place: same demonstrations and updates, several seeds, official chains.
+r"""Which of LanSAR's options help: same demonstrations and updates, several seeds, official chains.
 
     lansar-record --annotations=scripts/commands.yaml --validation_annotations=scripts/commands.yaml --cameras='[]' \
         --mode=chains --hours=8 --validation_hours=0.2 --variety=0.3 --seed=0 --workers=2 --output_dir=data/chains
@@ -8,8 +8,8 @@ r"""Which of LanSAR's options earn their place: same demonstrations and updates,
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
 Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
-desk, both with the sentences of scripts/commands.yaml. What is in --output_dir is not done again. Prints a Markdown
-table and writes what it is made of to --output_dir/results.json.
+desk, both with the sentences of scripts/commands.yaml. Runs that are in --output_dir already are not repeated. Prints a
+Markdown table and writes its numbers to --output_dir/results.json.
 """
 
 import hashlib
@@ -34,9 +34,9 @@ from lerobot_lansar.clip.store import dataset_fingerprint
 
 COMMANDS = Path(__file__).parents[1] / "scripts/commands.yaml"
 UNTRAINED_CLIP = ["--policy.clip.model=lansar-tiny", "--policy.clip.pretrained="]
-"""Nothing to download; it tells the few sentences of COMMANDS apart."""
+"""Needs no download, and distinguishes the few sentences of `COMMANDS`."""
 RUN = ("steps", "save_freq", "log_freq", "seed")
-"""What every run decides for itself, whatever the configuration file says."""
+"""Options whose values in the configuration file change no result: runs set them, or only log with them."""
 ACHIEVED = ["--policy.target=achieved"]
 THESIS_RULES = [
     "--policy.position_scale_start=3",
@@ -55,7 +55,7 @@ THESIS = [
     "--policy.window_start=episode",
     "--batch_size=24",
 ]
-"""Every choice of configs/thesis/baseline.yaml that is neither a size nor the optimizer's, as many steps an update; no
+"""The options of configs/thesis/baseline.yaml except sizes and optimizer, with as many steps per update; without
 pictures, since there is no trained CLIP here."""
 VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "recommended": ([], []),
@@ -82,7 +82,8 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "hidden 128, feedforward 512": (["--policy.hidden=128", "--policy.feedforward=512"], []),
     "learning rate 0.002": (["--policy.learning_rate=0.002"], []),
 }
-"""Name -> options of training and of evaluation, on top of the configuration file. Same training, same checkpoint."""
+"""Variant to its options of training and of evaluation, which override the configuration file. Variants with the same
+training options share a checkpoint."""
 
 
 @dataclass
@@ -120,12 +121,12 @@ def command(name: str, *arguments: str, log: Path) -> float:
 
 
 def key(*parts: Any) -> str:
-    """A short name for everything that decides a result."""
+    """A short name for everything that determines a result."""
     return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:12]
 
 
 def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]:
-    """The checkpoint of one training and the minutes it took; done once, whoever asks first."""
+    """The checkpoint of one training and the minutes that it took; the first caller trains, the others wait."""
     config = {k: v for k, v in yaml.safe_load(options.config.read_text()).items() if k not in RUN}
     frames = dataset_fingerprint(options.root)
     folder = options.output_dir / key(config, frames, options.updates, changes, seed)
@@ -152,7 +153,7 @@ def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]
 
 
 def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
-    """One training and its evaluation, or what is there of it."""
+    """One training and its evaluation; parts that exist already are not repeated."""
     training, evaluation = VARIANTS[variant]
     checkpoint, minutes = train(options, training, seed)
     folder = checkpoint.parents[3] / key(evaluation, options.chains)

@@ -1,14 +1,14 @@
-"""Milliseconds per control step: LanSAR with and without what it keeps, and LeRobot's ACT, Diffusion and VQ-BeT.
+"""Milliseconds per control step: LanSAR with and without its key-value cache, and LeRobot's ACT, Diffusion, VQ-BeT.
 
     python benchmarks/latency.py [--device=cpu] [--threads=1] [--environments=1] [--steps=64] [--output=FILE.json]
 
-Weights are random, which costs the same as trained ones, and nothing is downloaded. All policies at their default
-settings, on the desk's observations (state, static 200 x 200 and gripper 84 x 84 picture; Diffusion and VQ-BeT, which
-take pictures of one size only, or one picture, get the static one). Counted per executed action: the time of a chunk is
-divided by the actions carried out, that of several environments by their number.
+Weights are random, which costs the same as trained ones, and nothing is downloaded. All policies have their default
+settings and see the desk's observations: state, static 200 x 200 and gripper 84 x 84 picture. Diffusion and VQ-BeT,
+which take one picture or pictures of one size only, see the static one. Times are per executed action: the time of a
+chunk is divided by the actions executed, that of several environments by their number.
 
-LanSAR is measured with a full history: 64 control steps, in which one with --policy.window_slide=32 decodes its whole
-window twice. 30 Hz leaves 33 ms per step.
+LanSAR is measured with a full history, over 64 control steps; with --policy.window_slide=32 it decodes its whole window
+twice in them. At 30 Hz there are 33 ms per step.
 """
 
 import json
@@ -41,12 +41,12 @@ class Options:
     device: str = "cpu"
     threads: int = 1
     environments: int = 1
-    steps: int = 64  # of LanSAR, after its history is full; the others carry out two chunks, 16 actions at least
+    steps: int = 64  # of LanSAR, once its history is full; the others execute two action chunks, at least 16 actions
     output: Path | None = None
 
 
 def load_preset(name: str, device: str, **changes: Any) -> LanSARConfig:
-    """The policy section of a shipped configuration file, CLIP untrained so that nothing is downloaded."""
+    """The policy section of a shipped configuration file, with CLIP untrained so that nothing is downloaded."""
     options = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["policy"]
     options.pop("type")
     options["device"] = device
@@ -68,7 +68,7 @@ def observation(rows: int, device: str) -> dict[str, Any]:
 
 
 def timed(options: Options, call: Callable[[], Any]) -> float:
-    """Seconds of one call, a GPU's work included."""
+    """Seconds that one call takes, including its work on a GPU."""
     if options.device.startswith("cuda"):
         torch.cuda.synchronize()
     started = time.perf_counter()
@@ -85,7 +85,7 @@ def lansar(options: Options, preset: str, slide: int, name: str) -> dict[str, An
     preprocess, _ = make_lansar_pre_post_processors(config)
     seconds: dict[str, list[float]] = {"preprocessor": [], "policy": []}
     seen = preprocess(observation(options.environments, options.device))
-    for _ in range(config.window):  # the history; embeddings are random here
+    for _ in range(config.window):  # fill the history
         policy.select_action(seen)
     for _ in tqdm(range(options.steps), desc=name, leave=False):
         batch = observation(options.environments, options.device)
@@ -97,19 +97,19 @@ def lansar(options: Options, preset: str, slide: int, name: str) -> dict[str, An
 
 
 def whole_window(options: Options, preset: str, name: str) -> dict[str, Any]:
-    """The network on 64 steps from scratch: what a control step costs when nothing is kept."""
+    """The network on a whole window: what a control step costs when nothing is cached."""
     config = load_preset(preset, options.device)
     policy = LanSARPolicy(config).to(options.device).eval()
     n, rows, size = config.window, options.environments, config.network.clip_dim
     state = torch.randn(rows, n, 15, device=options.device)
     environment_state = torch.randn(rows, n, 24, device=options.device)
     command, static, gripper = (torch.randn(rows, *k, size, device=options.device) for k in ((), (n,), (n,)))
-    places = torch.arange(rows * n, device=options.device)
+    valid_steps = torch.arange(rows * n, device=options.device)
 
     def forward() -> None:
         with torch.no_grad():
             inputs = policy.scaler.encode(state, environment_state)
-            policy.network(command, *inputs, places, static, gripper)
+            policy.network(command, *inputs, valid_steps, static, gripper)
 
     forward()
     times = [timed(options, forward) for _ in tqdm(range(10), desc=name, leave=False)]
@@ -128,7 +128,7 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
     policy = get_policy_class(config.type)(config).to(options.device).eval()
     chunk = getattr(config, "n_action_steps", None) or config.action_chunk_size
     batch = {k: v for k, v in observation(options.environments, options.device).items() if k in features}
-    for _ in range(chunk):  # warm up, and stop at a chunk's end
+    for _ in range(chunk):  # warm up with one whole chunk
         policy.select_action(dict(batch))
     count = chunk * max(2, -(-16 // chunk))
     times = [
@@ -141,6 +141,7 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
 def row(
     name: str, policy: torch.nn.Module, preprocessor: float | None, seconds: float, slowest: float
 ) -> dict[str, Any]:
+    """A row of the table; times in seconds."""
     parameters = sum(p.numel() for p in policy.parameters())
     milliseconds = None if preprocessor is None else 1e3 * preprocessor
     return {
@@ -154,7 +155,7 @@ def row(
 
 @draccus.wrap()
 def main(options: Options) -> None:
-    """Measures and prints a Markdown table."""
+    """Measures everything and prints a Markdown table."""
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     thesis, recommended = "thesis/baseline", "lansar"

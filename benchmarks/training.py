@@ -1,15 +1,15 @@
-"""How fast LanSAR trains: what reading costs, the share of a step spent waiting for data, and its arithmetic.
+"""How fast LanSAR trains: the cost of reading, the share of time spent waiting for data, and the speed of updates.
 
     python benchmarks/training.py [--preset=lansar] [--root=DATASET] [--batch_size=96] [--updates=10]
         [--device=cpu] [--threads=1] [--output=FILE.json]
     python benchmarks/training.py --preset=thesis/baseline --batch_size=96 --num_workers=4 --device=cuda
 
-Reading: milliseconds of CPU per sample, a window of the preset's length (with picture embeddings if it uses them), the
-way LanSAR does it, by LeRobot's own delta timestamps, and the bare lookup in memory-mapped arrays, the floor.
+Reading: milliseconds of CPU per sample, a window of the preset's length (with picture embeddings if it uses them), as
+LanSAR reads it, with LeRobot's own delta timestamps, and as a bare lookup in memory-mapped arrays, the floor.
 
-Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, AdamW).
-FLOP are counted by PyTorch; the ceiling is its product of 2048 x 2048 matrices on the same device and dtype.
-Without --root it runs on random demonstrations of 64 steps made in a temporary folder.
+Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, AdamW). PyTorch
+counts the FLOP; the ceiling is its product of 2048 x 2048 matrices on the same device and dtype. Without --root the
+data are random demonstrations of 64 steps in a temporary folder.
 """
 
 import json
@@ -43,8 +43,8 @@ class Options:
     preset: str = "lansar"  # configs/<preset>.yaml
     root: Path | None = None  # a LeRobotDataset's folder
     batch_size: int = 96
-    num_workers: int = 0  # processes that fetch samples, as --num_workers of lerobot-train
-    updates: int = 10  # measured, after two to warm up
+    num_workers: int = 0  # processes that read samples, as --num_workers of lerobot-train
+    updates: int = 10  # measured, after two for warm-up
     device: str = "cpu"
     dtype: str = "float32"  # or bfloat16: mixed precision, as --policy.dtype
     threads: int = 1
@@ -52,7 +52,7 @@ class Options:
 
 
 def random_dataset(root: Path, embedding: int, episodes: int = 20, length: int = 64) -> None:
-    """A LeRobotDataset of random numbers, with `embedding` numbers per picture among its columns if not 0."""
+    """Makes a LeRobotDataset of random numbers; it has picture embeddings of size `embedding` as columns, none if 0."""
     sizes = {"observation.state": 15, "observation.environment_state": 24, "action": 7}
     if embedding:
         sizes |= {f"observation.clip.{name}": embedding for name in IMAGE_FEATURES}
@@ -69,7 +69,7 @@ def random_dataset(root: Path, embedding: int, episodes: int = 20, length: int =
 
 
 def random_embeddings(root: Path, frames: int, model: str, size: int) -> None:
-    """Picture embeddings of random numbers beside a dataset that has none."""
+    """Puts random picture embeddings beside a dataset."""
     clip_dir(root).mkdir()
     for key in IMAGE_FEATURES.values():
         values = np.random.default_rng(0).normal(size=(frames, size)).astype(np.float16)
@@ -80,7 +80,7 @@ def random_embeddings(root: Path, frames: int, model: str, size: int) -> None:
 
 
 def cpu_ms(call: Callable[[], Any], samples: int) -> float:
-    """Milliseconds of this process' CPU per sample, after a call to warm up."""
+    """Milliseconds of this process' CPU per sample, after one call to warm up."""
     call()
     started = time.process_time()
     call()
@@ -130,12 +130,13 @@ def ceiling(device: str, dtype: torch.dtype) -> float:
 
 
 def finished(device: str) -> None:
+    """Waits for a GPU to finish its work."""
     if device.startswith("cuda"):
         torch.cuda.synchronize()
 
 
 def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any]:
-    """Times of whole updates."""
+    """Times and arithmetic of whole updates."""
     dataset = LeRobotDataset("benchmark/random", root=root)
     policy = LanSARPolicy(config, dataset_meta=dataset.meta).to(options.device).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
@@ -175,7 +176,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
         batch = preprocess(next(source))
         finished(options.device)
         ready = time.perf_counter()
-        if number == 0:  # counted where attention is made of matrix products; fused kernels go uncounted on a CPU
+        if number == 0:  # on a CPU, the counter misses fused attention kernels: count with plain matrix products
             with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
                 update(batch)
             operations = counter.get_total_flops() // len(batch["valid_steps"])
@@ -204,7 +205,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
 
 @draccus.wrap()
 def main(options: Options) -> None:
-    """Measures and prints both tables."""
+    """Measures everything and prints both tables."""
     torch.set_num_threads(options.threads)
     config = load_preset(options.preset, options.device)
     with tempfile.TemporaryDirectory() as scratch:
