@@ -131,9 +131,8 @@ class Recorder:
     def add_step(self, _: LanSARPolicy) -> None:
         """Keeps the weights of the action just chosen, and the command that it was chosen for."""
         k = len(self._network.context_tokens)
-        layers = [
-            weights.pop()[0].float().cpu().numpy() for weights in self._new_context.values()
-        ]  # (heads, 1 or k, k)
+        # Per layer (heads, k, k), in the last one (heads, 1, k).
+        layers = [weights.pop()[0].float().cpu().numpy() for weights in self._new_context.values()]
         padded = [np.pad(w, ((0, 0), (0, k - w.shape[1]), (0, 0)), constant_values=np.nan) for w in layers]
         self._context.append(np.stack(padded))
         newest = {name: weights.pop()[0, :, -1].float().cpu().numpy() for name, weights in self._new_decoder.items()}
@@ -142,7 +141,7 @@ class Recorder:
         self._commands.append(self._env.call("task_description")[0])
 
     def attention(self) -> Attention:
-        """What was collected."""
+        """The weights, frames and commands collected so far."""
         return Attention(
             list(self._network.context_tokens),
             np.stack(self._context),

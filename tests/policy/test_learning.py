@@ -29,7 +29,7 @@ def block(environment, colour):
 
 
 def move(state, target):
-    """A robot that goes where it is told."""
+    """The robot state after an action that is carried out exactly."""
     state = state.copy()
     state[:6], state[14] = target[:6], target[6]
     return state
