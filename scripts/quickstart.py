@@ -20,7 +20,7 @@ DATA = Path("data/quickstart")
 OUT = Path("outputs/quickstart")
 CONFIG = "configs/lansar.yaml"
 UPDATES = 3000
-COMMANDS = "scripts/commands.yaml"
+SENTENCES = "configs/sentences.yaml"
 TASKS = [
     "open_drawer",
     "close_drawer",
@@ -80,7 +80,7 @@ def record_and_convert() -> None:
             "--episodes=1320",
             "--validation_episodes=55",
             "--cameras=[]",
-            f"--annotations={COMMANDS}",
+            f"--annotations={SENTENCES}",
             "--variety=0.3",
             "--seed=0",
             "--workers=2",
@@ -133,7 +133,7 @@ def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None
             f"--env.task={','.join(TASKS)}",
             "--env.control_mode=abs",
             "--env.cameras=[]",
-            f"--env.annotations={COMMANDS}",
+            f"--env.annotations={SENTENCES}",
             "--env.render_fps=6",
             f"--env.results_dir={folder}",
             f"--eval.n_episodes={EPISODES_PER_TASK}",

@@ -10,7 +10,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = [
-    ("lerobot_lansar.calvin", "lerobot_lansar.benchmark", "lerobot_lansar.command", "lerobot_lansar.jobs"),
+    (
+        "lerobot_lansar.calvin",
+        "lerobot_lansar.benchmark",
+        "lerobot_lansar.command",
+        "lerobot_lansar.jobs",
+        "lerobot_lansar.paths",
+    ),
     ("lerobot_lansar.clip",),
     ("lerobot_lansar.desk", "lerobot_lansar.policy", "lerobot_lansar.report", "dataset_convert"),
     ("lerobot_lansar.demos", "lerobot_lansar.envs"),

@@ -12,8 +12,10 @@ oracle           which tasks were fulfilled between two moments
 starts           random start states in which a task is feasible
 sentences        commands in words: a grammar, or a user's file
 errors           what users can cause
+quiet            imports pybullet without its greeting
 """
 
+from . import quiet  # noqa: F401  before the modules that import pybullet
 from .desk import Desk, Observation
 from .errors import DeskError, SimulationError
 from .oracle import BlockState, Snapshot, completed_tasks, is_fulfilled

@@ -167,7 +167,7 @@ def training_config(name):
 TRAINING = [
     str(file.relative_to(CONFIGS).with_suffix(""))
     for file in sorted(CONFIGS.rglob("*.yaml"))
-    if not file.name.startswith("eval")
+    if not file.name.startswith(("eval", "sentences"))
 ]
 
 
