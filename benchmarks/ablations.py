@@ -1,6 +1,6 @@
 r"""Which of LanSAR's options help: same demonstrations and updates, several seeds, official chains.
 
-    lansar-record --annotations=scripts/commands.yaml --validation_annotations=scripts/commands.yaml --cameras='[]' \
+    lansar-record --annotations=configs/sentences.yaml --validation_annotations=configs/sentences.yaml --cameras='[]' \
         --mode=chains --hours=8 --validation_hours=0.2 --variety=0.3 --seed=0 --workers=2 --output_dir=data/chains
     lansar-convert --root=data/chains --split=training --repo_id=lansar/chains --images=none --workers=2 \
         --output_dir=data/chains_lerobot
@@ -8,8 +8,8 @@ r"""Which of LanSAR's options help: same demonstrations and updates, several see
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
 Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
-desk, both with the sentences of scripts/commands.yaml. Runs that are in --output_dir already are not repeated. Prints a
-Markdown table and writes its numbers to --output_dir/results.json.
+desk, both with the sentences of configs/sentences.yaml. Runs that are in --output_dir already are not repeated. Prints
+a Markdown table and writes its numbers to --output_dir/results.json.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 from lerobot_lansar.clip.store import dataset_fingerprint
 
-COMMANDS = Path(__file__).parents[1] / "scripts/commands.yaml"
+COMMANDS = Path(__file__).parents[1] / "configs/sentences.yaml"
 UNTRAINED_CLIP = ["--policy.clip.model=lansar-tiny", "--policy.clip.pretrained="]
 """Needs no download, and distinguishes the few sentences of `COMMANDS`."""
 RUN = ("steps", "save_freq", "log_freq", "seed")
