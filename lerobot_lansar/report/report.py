@@ -10,7 +10,7 @@ from typing import Any
 import draccus
 
 from ..benchmark import EPISODES_FILE, load_chains
-from ..command import run_command
+from ..command import CommandError, run_command
 from .results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
 
 
@@ -26,8 +26,9 @@ class ReportConfig:
     results_dir: Path | None = None
     # --seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000
     seed: int | None = None
-    # --policy.path of that run; the report then states whether the policy reads the simulator's own state
-    policy_path: Path | None = None
+    # --policy.path of that run, a folder or a name on the hub; the report then states whether the policy reads the
+    # simulator's own state
+    policy_path: str | None = None
 
 
 def report(config: ReportConfig) -> dict[str, Any]:
@@ -42,6 +43,7 @@ def report(config: ReportConfig) -> dict[str, Any]:
     Raises:
         FileNotFoundError: A file is missing.
         ValueError: A file is malformed, or the files are of different evaluations.
+        CommandError: There is no policy at `policy_path`.
     """
     results_dir = config.results_dir or config.eval_dir
     if not results_dir.is_dir():
@@ -66,16 +68,30 @@ def report(config: ReportConfig) -> dict[str, Any]:
     return summary
 
 
-def _reads_scene_state(policy_path: Path | None) -> bool | None:
+def _reads_scene_state(policy_path: str | None) -> bool | None:
+    """Whether the policy's inputs include the simulator's own state; None without a policy."""
     if policy_path is None:
         return None
-    path = policy_path / "config.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} is missing: --policy_path must be a pretrained_model folder")
-    policy = json.loads(path.read_text())
+    policy = json.loads(_policy_config(policy_path).read_text())
     # LanSAR may ignore the scene state although its inputs include it.
     is_used = policy.get("use_spatial_context", True)
     return is_used and "observation.environment_state" in (policy.get("input_features") or {})
+
+
+def _policy_config(policy_path: str) -> Path:
+    """A policy's `config.json`: in a folder, or else downloaded from the hub."""
+    file = Path(policy_path) / "config.json"
+    if file.is_file():
+        return file
+    from huggingface_hub import hf_hub_download  # late: most reports need no hub
+
+    try:
+        return Path(hf_hub_download(policy_path, "config.json"))
+    except (OSError, ValueError) as error:
+        raise CommandError(
+            f"--policy_path={policy_path} is neither a pretrained_model folder with a config.json nor a policy that "
+            f"the hub returns: {error}"
+        ) from error
 
 
 def _notes(summary: dict[str, Any], chains_known: bool) -> list[str]:
@@ -89,6 +105,11 @@ def _notes(summary: dict[str, Any], chains_known: bool) -> list[str]:
         notes.append("The policy reads the simulator's own scene state (privileged), which a real robot does not have.")
     elif summary["policy_reads_scene_state"] is None:
         notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
+    if summary["ended_early"]:
+        notes.append(
+            f"{summary['ended_early']} episodes failed because the desk refused an action or the simulation diverged: "
+            f"see `reason` in {EPISODES_FILE}."
+        )
     if "in_a_row" in summary and not chains_known:
         notes.append(
             "The files do not say which chains these are: success per task is right only if --seed was "

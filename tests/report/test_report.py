@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lerobot_lansar.benchmark import EPISODES_FILE, Chain
+from lerobot_lansar.command import CommandError
 from lerobot_lansar.report import report as report_module
 from lerobot_lansar.report import results
 from lerobot_lansar.report.report import ReportConfig, report
@@ -160,9 +161,24 @@ def test_lines_of_two_evaluations_in_one_folder_are_noticed(tmp_path):
 )
 def test_privileged_scene_state_is_stated(tmp_path, config, privileged):
     (tmp_path / "config.json").write_text(json.dumps(config))
-    summary = report(ReportConfig(write_eval(tmp_path / "eval", ("calvin", [0.0])), policy_path=tmp_path))
+    summary = report(ReportConfig(write_eval(tmp_path / "eval", ("calvin", [0.0])), policy_path=str(tmp_path)))
     assert summary["policy_reads_scene_state"] is privileged
     assert any("privileged" in note for note in summary["notes"]) is privileged
+
+
+def test_the_policy_may_be_one_on_the_hub(tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    folder = tmp_path / "hub/models--you--policy"
+    (folder / "snapshots/abc").mkdir(parents=True)
+    (folder / "refs").mkdir()
+    (folder / "refs/main").write_text("abc")
+    (folder / "snapshots/abc/config.json").write_text('{"input_features": {"observation.environment_state": {}}}')
+    config = ReportConfig(write_eval(tmp_path / "eval", ("calvin", [0.0])), policy_path="you/policy")
+    assert report(config)["policy_reads_scene_state"] is True
+    for missing in ("you/other", "outputs/train/no/such/folder"):
+        config.policy_path = missing
+        with pytest.raises(CommandError, match=f"--policy_path={missing} is neither"):
+            report(config)
 
 
 def test_only_original_assets_are_called_comparable(tmp_path):
