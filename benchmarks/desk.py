@@ -138,8 +138,8 @@ def cases(options: Options) -> dict[str, Callable[[], object]]:
         "physics floor": floor,
         "no cameras": stepping(cameras=()),
         "no cameras, oracle": with_oracle,
-        "both cameras, fast": stepping(),
-        "both cameras, fast_gl": stepping(renderer="fast_gl"),
+        "both cameras, gl": stepping(),
+        "both cameras, tiny": stepping(renderer="tiny"),
         "naive loop": lambda: slow.step(slow_act()),
     }
 
@@ -212,10 +212,10 @@ def main() -> None:
             f"{name:24s} {1 / seconds:7.1f} {1e3 * seconds:9.3f} {seconds / medians['physics floor']:9.2f}"
             f" {medians['naive loop'] / seconds:14.1f}"
         )
-    print(f"both cameras, fast: 1 process {rates['1']:.1f} steps/s, 2 processes {rates['2']:.1f}: ", end="")
+    print(f"both cameras, gl: 1 process {rates['1']:.1f} steps/s, 2 processes {rates['2']:.1f}: ", end="")
     print(f"{rates['2'] / rates['1']:.2f} times")
     compared = {}
-    for ours, reference in (("fast", "tiny"), ("fast_gl", "egl")):
+    for ours, reference in (("tiny", "pybullet_tiny"), ("gl", "pybullet_gl")):
         try:
             compared[f"{ours} / {reference}"] = differences(options, ours, reference)
         except DeskError as error:

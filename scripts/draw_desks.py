@@ -26,7 +26,7 @@ class Options:
     assets: Path | None = None
 
 
-def posed(scene: str, assets: Path | None = None, renderer: str = "fast") -> Desk:
+def posed(scene: str, assets: Path | None = None, renderer: str = "gl") -> Desk:
     """A desk with drawer and door partly open, and the lights on."""
     desk = Desk(scene, assets, cameras=(), renderer=renderer)
     state = desk.reset(seed=3)["scene_obs"]
@@ -44,12 +44,12 @@ def column(scene: str) -> np.ndarray:
 def looks(assets: Path) -> Image.Image:
     """One row per scene, one column per renderer, on both kinds of assets."""
     kinds = [
-        ("built in, fast", None, "fast"),
-        ("built in, fast_gl", None, "fast_gl"),
-        ("CALVIN's files, fast", assets, "fast"),
-        ("CALVIN's files, tiny (original)", assets, "tiny"),
-        ("CALVIN's files, fast_gl", assets, "fast_gl"),
-        ("CALVIN's files, egl (original)", assets, "egl"),
+        ("built in, gl", None, "gl"),
+        ("built in, tiny", None, "tiny"),
+        ("CALVIN's files, tiny", assets, "tiny"),
+        ("CALVIN's files, pybullet_tiny", assets, "pybullet_tiny"),
+        ("CALVIN's files, gl", assets, "gl"),
+        ("CALVIN's files, pybullet_gl", assets, "pybullet_gl"),
     ]
     sheet = Image.new("RGB", (200 * len(kinds), 22 + 200 * len(SCENES)), "white")
     draw = ImageDraw.Draw(sheet)

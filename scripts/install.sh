@@ -3,7 +3,7 @@
 set -eu
 python=$(sh scripts/find_python.sh)
 command -v c++ >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || {
-    echo "A C++ compiler is needed to build pybullet (for example: apt install g++)." >&2
+    echo "A C++ compiler is needed to build pybullet, for example: apt install g++. Without one: docs/installation.md" >&2
     exit 1
 }
 if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info < (3, 12))' >/dev/null 2>&1; then
@@ -20,23 +20,10 @@ echo "installing with $python (torch and pybullet take some minutes the first ti
 # Compiled now: where PYTHONDONTWRITEBYTECODE is set every command would compile LeRobot anew (13 s instead of 5).
 "$uv" pip install --compile-bytecode --python .venv/bin/python --constraint constraints.txt --editable '.[dev]'
 
-# A pybullet built without numpy may wait in uv's cache and would be reused silently.
-numpy_enabled() {
-    .venv/bin/python -c 'import pybullet, sys; sys.exit(not pybullet.isNumpyEnabled())' >/dev/null
-}
-if ! numpy_enabled; then
-    echo "pybullet came without numpy support: building it again"
-    "$uv" pip install --python .venv/bin/python --constraint constraints.txt \
-        --reinstall-package pybullet --refresh-package pybullet --no-cache --editable '.[dev]'
-    numpy_enabled || {
-        echo "pybullet still lacks numpy support; see 'Installing pybullet' in README.md" >&2
-        exit 1
-    }
-fi
 echo "compiling the renderers (once)"
 .venv/bin/python -c '
 from lerobot_lansar.desk import Desk
-for renderer in ("fast", "fast_gl"):
+for renderer in ("gl", "tiny"):
     with Desk("D", renderer=renderer): pass
 ' >/dev/null
 touch .venv/.installed

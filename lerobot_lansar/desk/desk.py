@@ -53,8 +53,8 @@ class Desk:
         scene: `"A"`, `"B"`, `"C"`, `"D"`, or `"D_eval"`: D with calvin_env's fixed evaluation layout.
         assets: None for the built-in desk, or the `data` folder of a calvin_env checkout for the original files.
         cameras: Cameras whose pictures observations hold: any of `"static"` (200x200) and `"gripper"` (84x84).
-        renderer: `"fast"` (ours, with TinyRenderer's look), `"fast_gl"` (ours, with the OpenGL look of CALVIN's public
-            data), `"tiny"` or `"egl"` (PyBullet's own). It is set up when the first picture is drawn.
+        renderer: `"gl"` (ours, with the look of CALVIN's public data), `"tiny"` (ours, with TinyRenderer's look),
+            `"pybullet_gl"` or `"pybullet_tiny"` (PyBullet's own). It is set up when the first picture is drawn.
         depth: Whether observations also hold `depth_<camera>`.
 
     Attributes:
@@ -62,7 +62,7 @@ class Desk:
         assets: `"built-in"` or `"original"`.
 
     Raises:
-        DeskError: Unknown scene, camera or renderer, missing asset files, no driver for `egl`.
+        DeskError: Unknown scene, camera or renderer, missing asset files, no driver for `pybullet_gl`.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Desk:
         scene: str = "D",
         assets: str | Path | None = None,
         cameras: Sequence[str] = ("static", "gripper"),
-        renderer: str = "fast",
+        renderer: str = "gl",
         depth: bool = False,
     ):
         _check_cameras(cameras)
@@ -106,7 +106,9 @@ class Desk:
 
     def _load(self, files: Assets) -> None:
         client = self._client
-        self._egl_plugin = load_egl(client) if self.renderer == "egl" else None  # it draws only what is loaded later
+        self._egl_plugin = (
+            load_egl(client) if self.renderer == "pybullet_gl" else None
+        )  # it draws only what is loaded later
         p.setGravity(0, 0, -9.8, physicsClientId=client)
         self._robot = Robot(client, files)
         self._blocks = load_blocks(client, files, self.scene)

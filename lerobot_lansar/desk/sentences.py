@@ -233,7 +233,7 @@ def _sentences(split: int) -> dict[str, list[str]]:
 
 
 COMMANDS: dict[str, dict[str, list[str]]] = {"training": _sentences(0), "validation": _sentences(1)}
-"""Split to task to sentences; evaluations use a task's first validation sentence."""
+"""Split to task to sentences. Evaluations command a task by its first validation sentence, or by any of them."""
 
 
 def load_commands(file: str | Path | None, split: str) -> dict[str, list[str]]:

@@ -151,7 +151,9 @@ def test_errors_name_what_is_wrong(tmp_path, desk):
         Desk("E")
     with pytest.raises(DeskError, match="camera 'wrist' is unknown"):
         Desk("D", cameras=("wrist",))
-    with pytest.raises(DeskError, match=r"renderer 'vulkan' is unknown; choose among fast, fast_gl, tiny, egl"):
+    with pytest.raises(
+        DeskError, match=r"renderer 'vulkan' is unknown; choose among gl, tiny, pybullet_gl, pybullet_tiny"
+    ):
         Desk("D", renderer="vulkan")
     with pytest.raises(DeskError, match=r"panda_longer_finger\.urdf is missing"):
         Desk("D", assets=tmp_path)

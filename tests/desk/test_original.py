@@ -156,7 +156,7 @@ def test_tasks_are_calvins_in_calvins_order(golden):
 TAGS = [f"{scene}_{state}" for scene in "ABCD" for state in ("0_on", "0_off", "1_on", "1_off")]
 
 
-@pytest.mark.parametrize("renderer", ["tiny", "fast"])
+@pytest.mark.parametrize("renderer", ["pybullet_tiny", "tiny"])
 @pytest.mark.parametrize("tag", TAGS)
 def test_pictures_equal_the_originals(golden, original_assets, tag, renderer):
     states = json.loads((golden / "images" / "states.json").read_text())

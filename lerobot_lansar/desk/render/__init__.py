@@ -1,13 +1,16 @@
 """Pictures of a desk, by four renderers behind one switch.
 
-`fast` and `fast_gl` are ours (numba, no driver) and imitate the looks of `tiny` and `egl`, PyBullet's own renderers.
+`gl` and `tiny` are ours: numba, one CPU core, no driver. `gl` has the look of CALVIN's public data, which a GPU drew
+through PyBullet's OpenGL renderer; `tiny` that of PyBullet's TinyRenderer. `pybullet_gl` and `pybullet_tiny` are
+PyBullet's own renderers, the reference for ours.
 
-bullet           `tiny` and `egl`
-fast             what our two renderers share
-tiny_look        `fast`
-gl_look          `fast_gl`
-raster           compiled: which triangle is nearest at each pixel
+bullet           `pybullet_gl` and `pybullet_tiny`
+software         what our two renderers share
+gl_look          `gl`
+tiny_look        `tiny`
+raster           compiled: which face is nearest at each pixel, how high the casters of shadow are
 shading          compiled: the colour of each pixel, in the two looks
+geometry         all faces in flat arrays, in clusters that are skipped as a whole
 stage            what there is to draw, and its present pose
 visuals          the triangles, colours and textures of all bodies
 kinematics       where links are, from joint positions
@@ -21,9 +24,12 @@ import numpy as np
 from ..cameras import Intrinsics
 from .bullet import BulletRenderer, Colors, load_egl
 
-__all__ = ["RENDERERS", "Colors", "Renderer", "load_egl", "open_renderer"]
+__all__ = ["OURS", "RENDERERS", "Colors", "Renderer", "load_egl", "open_renderer"]
 
-RENDERERS = ("fast", "fast_gl", "tiny", "egl")
+OURS = ("gl", "tiny")
+"""Renderers that need no driver."""
+
+RENDERERS = (*OURS, "pybullet_gl", "pybullet_tiny")
 
 
 class Renderer(Protocol):
@@ -32,7 +38,7 @@ class Renderer(Protocol):
     def draw(
         self, intrinsics: Intrinsics, view: np.ndarray, size: int, colors: Colors, fixed: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As `fast.FastRenderer.draw`."""
+        """As `software.SoftwareRenderer.draw`."""
 
 
 def open_renderer(
@@ -44,12 +50,12 @@ def open_renderer(
         name: One of `RENDERERS`.
         client: Bullet client.
         repainted: (body, link) whose colours change.
-        egl_plugin: For `egl`: from `load_egl`.
+        egl_plugin: For `pybullet_gl`: from `load_egl`.
 
     Raises:
         DeskError: A mesh cannot be read, or pybullet was built without numpy.
     """
-    if not name.startswith("fast"):
+    if name not in OURS:
         return BulletRenderer(client, egl_plugin)
     # late: numba and its kernels take a second to load, and not everybody needs pictures
     from .gl_look import OpenGLLook
@@ -57,5 +63,5 @@ def open_renderer(
     from .tiny_look import TinyLook
     from .visuals import read_visuals
 
-    look = TinyLook if name == "fast" else OpenGLLook
-    return look(Stage(client, read_visuals(client, round_boxes=name == "fast_gl"), repainted))
+    look = TinyLook if name == "tiny" else OpenGLLook
+    return look(Stage(client, read_visuals(client, round_boxes=name == "gl"), repainted))

@@ -46,7 +46,7 @@ class BulletRenderer:
     def draw(
         self, intrinsics: Intrinsics, view: np.ndarray, size: int, colors: Colors, fixed: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As `fast.FastRenderer.draw`."""
+        """As `software.SoftwareRenderer.draw`."""
         for (body, link), color in colors.items():
             if self._shown.get((body, link)) != color:
                 p.changeVisualShape(body, link, rgbaColor=color, physicsClientId=self._client)
@@ -87,7 +87,7 @@ def load_egl(client: int) -> int:
     plugin = p.loadPlugin(found.origin, _PLUGIN, physicsClientId=client) if works and found else -1
     if plugin < 0:
         raise DeskError(
-            "renderer egl: pybullet's EGL plugin could not be loaded; it needs an OpenGL driver with EGL (Debian and "
-            "Ubuntu: libegl1 and a GPU driver or libgl1-mesa-dri). Renderer fast_gl draws the same look without one"
+            "renderer pybullet_gl: pybullet's EGL plugin could not be loaded; it needs an OpenGL driver with EGL "
+            "(Debian and Ubuntu: libegl1 and a GPU driver or libgl1-mesa-dri). Renderer gl draws the same look without one"
         )
     return plugin

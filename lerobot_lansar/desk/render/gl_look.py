@@ -1,31 +1,33 @@
-"""`renderer="fast_gl"`: the pictures that Bullet's OpenGL renderer draws, among them those of CALVIN's public data."""
+"""`renderer="gl"`: the pictures that Bullet's OpenGL renderer draws on a GPU, CALVIN's public data among them."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image
 
-from ..cameras import Intrinsics
 from . import raster, shading
-from .fast import FastRenderer, pack
+from .software import Frame, Layer, SoftwareRenderer, pack
 from .stage import Stage
 
 LIGHT = np.array([-5.0, -40.0, 200.0])
-"""Position of the EGL plugin's light, m."""
-HIGHLIGHT_EYE = 20 * np.array([np.sin(np.radians(20)), -np.cos(np.radians(20)), 0.0])
-"""Position of the camera for which the plugin computes highlights, m: always that of its own window."""
-BACKGROUND = (179, 179, 204)
+"""Where the EGL plugin's light is, m."""
+HIGHLIGHT_EYE = np.array([-2.0, -0.17, 0.0])
+"""The eye (m) that highlights are for: not the camera's. Fitted to a frame of the public data."""
 
 TEXELS_PER_METRE = 4096 / 20
-"""Resolution of the plugin's shadow map, which spans 20 m around the origin."""
-STEP = 299 / 65535
-"""Height of one step of the shadow map's 16 bits (m): it spans distances of 1 to 300 m."""
+"""Of the plugin's shadow map, which spans 20 m around the origin."""
+_NOWHERE = np.array([1 << 30, -1, 1 << 30, -1])
+_NO_SURFACE = np.zeros((1, 1, 8), np.float32)
 _REGION = (-1.45, 0.85, -1.55, 0.7, 0.0, 1.3)
-"""Minimum and maximum x, y and z of everything that can cast a shadow (m)."""
+"""Box (m) around everything that can cast a shadow: x, y and z, lowest and highest."""
 
 
-class OpenGLLook(FastRenderer):
+class OpenGLLook(SoftwareRenderer):
     """Trilinear texels, one near light with highlights and a shadow, grey-blue background."""
 
     sample = 0.5
+    first_wins = True
+    background = (179, 179, 204)
 
     def __init__(self, stage: Stage):
         super().__init__(stage)
@@ -40,76 +42,90 @@ class OpenGLLook(FastRenderer):
         self._levels, self._texels = pack(levels)
         self._textures = np.array([ranges.get(id(image), (0, 0)) for image in images], np.int64)
         self._shadow, extent = shadow_matrix()
-        self._casters = np.zeros((extent, extent), np.float32)
+        self._lamp = np.stack([LIGHT, HIGHLIGHT_EYE])
         poses = self._stage.poses()
+        self._casters = np.zeros((extent, extent), np.float32)
         self._cast(self._still, poses, self._casters)
-        self._heights, self._shadow_poses = self._casters, np.zeros(0)
+        # The same with the links that have not moved lately, which links they are, and where all were.
+        self._base = self._casters, _NOWHERE, list[int](), poses.copy()
+        self._heights, self._touched, self._heights_of = self._casters, _NOWHERE, np.zeros(0)
 
-    def _blank(self, size: int) -> np.ndarray:
-        return np.zeros((size, size, 8), np.float32)
+    def _prepare(self, poses: np.ndarray) -> None:
+        if np.array_equal(poses, self._heights_of):  # both cameras see the same shadow
+            return
+        settled, touched, groups, before = self._base
+        same = (poses == before).all((1, 2))
+        if groups != (groups := [i for i in self._jointed if same[i]]):
+            settled = self._casters.copy()
+            touched = self._cast(groups, poses, settled)
+        self._base = settled, touched, groups, poses.copy()
+        self._heights = settled.copy()
+        written = self._cast([i for i in self._moving if i not in groups], poses, self._heights)
+        self._touched = np.where([True, False, True, False], np.minimum(touched, written), np.maximum(touched, written))
+        self._heights_of = self._base[3]
 
-    def _encoding(self, intrinsics: Intrinsics, group: int) -> tuple[float, float, float]:
-        """The plugin asks for a depth buffer of 8 bits and gets 16; at equal depth, what was loaded first wins."""
-        offset, scale = _depth_steps(intrinsics)
-        return offset, scale, float(raster.RANKS - 1 - group % raster.RANKS)
+    def _surface(self, size: int) -> np.ndarray:
+        surface = np.zeros((size, size, 8), np.float32)
+        surface[..., 5] = -1e6  # far from any shadow
+        return surface
 
-    def _inverse_depth(self, depth_buffer: np.ndarray, intrinsics: Intrinsics) -> np.ndarray:
-        offset, scale = _depth_steps(intrinsics)
-        steps = np.floor(depth_buffer / raster.RANKS)
-        return np.where(depth_buffer > 0, (steps - offset) / scale, 0).astype(np.float32)
-
-    def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
-        shading.light_gl(
+    def _shade(
+        self, ids: np.ndarray, matrices: np.ndarray, rgba: np.ndarray, frame: Frame, layer: Layer | None
+    ) -> None:
+        geometry = self._geometry
+        back = np.linalg.inv(frame.projection[:, :3])
+        world = np.column_stack([back, -back @ frame.projection[:, 3]])
+        # a layer keeps what does not change: the shadow of what never moves
+        heights, surface = (self._heights, _NO_SURFACE) if layer is None else (self._casters, layer.surface)
+        shading.shade_gl(
             ids,
-            self._faces,
-            self._screen,
-            self._owner,
-            self._normals,
-            self._uvs,
+            frame.inverse_depth,
+            geometry.corners,
+            matrices,
+            geometry.shapes,
+            self._groups,
+            geometry.normals,
+            geometry.uvs,
             self._textures,
             self._levels,
             self._texels,
-            colors,
-            poses,
-            self._groups,
-            self._vertices,
-            LIGHT,
-            HIGHLIGHT_EYE,
+            rgba,
+            frame.poses[:, :3, :3].copy(),
+            world,
+            self._lamp,
             self._shadow,
-            canvas,
+            heights,
+            frame.picture,
+            layer is not None,
+            surface,
         )
 
-    def _finish(self, canvas: np.ndarray, depth_buffer: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        if not np.array_equal(poses, self._shadow_poses):  # both cameras see the same shadow
-            self._heights = self._casters.copy()
-            self._cast(self._moving, poses, self._heights)
-            self._shadow_poses = poses.copy()
-        picture = np.empty((*depth_buffer.shape, 3), np.uint8)
-        picture[:] = BACKGROUND
-        shading.compose_gl(canvas, depth_buffer, self._heights, STEP, picture)
-        return picture
+    def _relight(self, layer: Layer, ids: np.ndarray, frame: Frame) -> None:
+        shading.relight(
+            ids, layer.inverse_depth, layer.surface, self._casters, self._heights, self._touched, frame.picture
+        )
 
-    def _cast(self, groups: list[int], poses: np.ndarray, heights: np.ndarray) -> None:
-        """Enters the back faces of groups into the shadow map `heights`."""
-        ids = np.empty(heights.shape, np.int32)
-        limits = np.float32(1e-6), np.float32(np.inf)
-        matrices = (self._shadow @ poses).astype(np.float32)
-        for group in groups:
-            part = self._parts[group]
-            raster.project_flat(self._vertices[:, part.vertices], matrices[group], self._screen[part.vertices])
-            self._enter(part, False, limits, (0.0, 0.0, 0.0), heights, ids)
-
-
-def _depth_steps(intrinsics: Intrinsics) -> tuple[float, float]:
-    """(offset, scale): what is w m away is offset + scale / w steps of 16 bits in front of the far plane."""
-    near, far = intrinsics.near, intrinsics.far
-    return -65535 * near / (far - near), 65535 * far * near / (far - near)
+    def _cast(self, groups: Sequence[int], poses: np.ndarray, heights: np.ndarray) -> np.ndarray:
+        """Enters groups into the shadow map; returns first and last column, first and last row that were written."""
+        touched = _NOWHERE.copy()
+        matrices, geometry = self._shadow @ poses, self._geometry
+        raster.cast(
+            np.asarray(groups, np.int64),
+            matrices.astype(np.float32),
+            matrices[:, 2, :3],
+            geometry.ranges,
+            geometry.cones,
+            geometry.corners,
+            heights,
+            touched,
+        )
+        return touched
 
 
 def shadow_matrix() -> tuple[np.ndarray, int]:
-    """World to the shadow map, (3, 4): column, row and height towards the light (m); and its side in texels.
+    """World to the shadow map, (3, 4): column, row and height towards the light (m); and how many texels a side has.
 
-    Columns run in the opposite direction of the plugin's. This turns back faces, which cast the shadow, to the front.
+    The columns run against the plugin's, so that the back faces, which cast the shadow, turn to the front.
     """
     forward = -LIGHT / np.linalg.norm(LIGHT)
     up = np.cross(np.array([1.0, 0.0, 0.0]), -forward)
@@ -126,9 +142,12 @@ def shadow_matrix() -> tuple[np.ndarray, int]:
 
 
 def mipmaps(texture: np.ndarray) -> list[np.ndarray]:
-    """A texture and its halvings down to one texel; every texel is the mean of those that it covers."""
+    """A texture and its halvings down to one texel, each the mean of what it covers; halves are rounded down, as the
+    GPU did that recorded the public data."""
     levels = [texture]
     while max(levels[-1].shape[:2]) > 1:
-        height, width = (max(1, n // 2) for n in levels[-1].shape[:2])
-        levels.append(np.array(Image.fromarray(levels[-1]).resize((width, height), Image.Resampling.BOX)))
+        size = tuple(max(1, n // 2) for n in levels[-1].shape[1::-1])
+        channels = [Image.fromarray(levels[-1][..., i].astype(np.float32)) for i in range(3)]
+        means = [np.array(channel.resize(size, Image.Resampling.BOX)) for channel in channels]
+        levels.append(np.ceil(np.stack(means, -1) - 0.5 - 1e-4).astype(np.uint8))
     return levels

@@ -1,115 +1,142 @@
-"""Which triangle is nearest at each pixel, compiled by numba.
+"""Triangles to pixels, compiled by numba: which face is nearest at each pixel, and how high the casters of shadow are.
 
-Screen coordinates are TinyRenderer's: pixel (column, row) is sampled at the integer point (column, row), row 0 at the
-bottom. w is the distance along the view axis (m). The code is tuned for many triangles much smaller than a pixel, most
-of which contain no sample.
+Screen coordinates: pixel (column, row) is sampled at the integer point (column, row), row 0 at the bottom. Everything
+is written for many triangles much smaller than a pixel, of which most touch no sample at all.
 """
 
 import numpy as np
 from numba import njit
 
+from .geometry import CLUSTER
+
 NOTHING = -1
-"""Face number of a pixel that shows no face."""
-RANKS = 256
-"""Number of ranks in an integer depth buffer; 2**16 times as many values still fit into a float32."""
+_VECTOR = {"contract", "arcp", "nsz"}  # what lets a compiler work on eight faces at once
 
 
 @njit(cache=True, error_model="numpy")
-def outside(matrix, center, radius, size):  # type: ignore[no-untyped-def]
-    """Whether a sphere, center (3,) and radius (m), lies beyond one of the four sides of the picture.
+def outside(matrix, x, y, z, radius, size):  # type: ignore[no-untyped-def]
+    """Whether a sphere (m) lies beyond one of the four sides of the picture.
 
-    `matrix` (3, 4) maps points to homogeneous pixels (column * w, row * w, w).
+    `matrix` (3, 4) maps points to homogeneous pixels (column * w, row * w, w), w the distance along the view axis.
     """
     for side in range(4):
         row = side // 2
-        distance, square = 0.0, 0.0
-        for i in range(4):
-            a = matrix[row, i] if side % 2 == 0 else (size - 1) * matrix[2, i] - matrix[row, i]
-            distance += a * center[i] if i < 3 else a
-            square += a * a if i < 3 else 0.0
-        if distance < -radius * np.sqrt(square):
+        a, b, c, d = matrix[row, 0], matrix[row, 1], matrix[row, 2], matrix[row, 3]
+        if side % 2 == 1:
+            end = size - 1
+            a, b = end * matrix[2, 0] - a, end * matrix[2, 1] - b
+            c, d = end * matrix[2, 2] - c, end * matrix[2, 3] - d
+        if a * x + b * y + c * z + d < -radius * np.sqrt(a * a + b * b + c * c):
             return True
     return False
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-def project(vertices, matrix, screen):  # type: ignore[no-untyped-def]
-    """Vertices (3, V) to `screen` (V, 3): column, row, w. Returns whether any vertex lies behind the eye."""
-    m00, m01, m02, m03 = matrix[0]
-    m10, m11, m12, m13 = matrix[1]
-    m20, m21, m22, m23 = matrix[2]
-    x, y, z = vertices[0], vertices[1], vertices[2]
-    min_w = np.float32(np.inf)
-    for v in range(x.size):
-        w = m20 * x[v] + m21 * y[v] + m22 * z[v] + m23
-        screen[v, 0] = (m00 * x[v] + m01 * y[v] + m02 * z[v] + m03) / w
-        screen[v, 1] = (m10 * x[v] + m11 * y[v] + m12 * z[v] + m13) / w
-        screen[v, 2] = w
-        min_w = min(min_w, w)
-    return min_w <= 0
+@njit(cache=True, error_model="numpy", fastmath=_VECTOR, inline="never")
+def _project(corners, m, screen):  # type: ignore[no-untyped-def]
+    """A cluster's corners (9, CLUSTER) to `screen` (9, CLUSTER): column, row, w of each. Returns the smallest w."""
+    m00, m01, m02, m03 = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
+    m10, m11, m12, m13 = m[1, 0], m[1, 1], m[1, 2], m[1, 3]
+    m20, m21, m22, m23 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
+    one, smallest = np.float32(1), np.float32(np.inf)
+    for corner in range(3):
+        xs, ys, zs = corners[3 * corner], corners[3 * corner + 1], corners[3 * corner + 2]
+        columns, rows, depths = screen[3 * corner], screen[3 * corner + 1], screen[3 * corner + 2]
+        for i in range(CLUSTER):
+            x, y, z = xs[i], ys[i], zs[i]
+            w = m20 * x + m21 * y + m22 * z + m23
+            inverse_depth = one / w
+            columns[i] = (m00 * x + m01 * y + m02 * z + m03) * inverse_depth
+            rows[i] = (m10 * x + m11 * y + m12 * z + m13) * inverse_depth
+            depths[i] = w
+            smallest = min(smallest, w)
+    return smallest
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-def project_flat(vertices, matrix, screen):  # type: ignore[no-untyped-def]
-    """As `project`, without perspective: column, row and 1 / the third coordinate."""
-    x, y, z = vertices[0], vertices[1], vertices[2]
-    for v in range(x.size):
-        screen[v, 0] = matrix[0, 0] * x[v] + matrix[0, 1] * y[v] + matrix[0, 2] * z[v] + matrix[0, 3]
-        screen[v, 1] = matrix[1, 0] * x[v] + matrix[1, 1] * y[v] + matrix[1, 2] * z[v] + matrix[1, 3]
-        screen[v, 2] = 1 / (matrix[2, 0] * x[v] + matrix[2, 1] * y[v] + matrix[2, 2] * z[v] + matrix[2, 3])
+@njit(cache=True, error_model="numpy", fastmath=_VECTOR, inline="never")
+def _project_flat(corners, m, screen):  # type: ignore[no-untyped-def]
+    """As `_project` without perspective: column, row and the third coordinate."""
+    for corner in range(3):
+        xs, ys, zs = corners[3 * corner], corners[3 * corner + 1], corners[3 * corner + 2]
+        for axis in range(3):
+            m0, m1, m2, m3 = m[axis, 0], m[axis, 1], m[axis, 2], m[axis, 3]
+            row = screen[3 * corner + axis]
+            for i in range(CLUSTER):
+                row[i] = m0 * xs[i] + m1 * ys[i] + m2 * zs[i] + m3
+
+
+@njit(cache=True, error_model="numpy", fastmath=_VECTOR, inline="never")
+def _touch_samples(screen, end, min_area, flags):  # type: ignore[no-untyped-def]
+    """Flags (CLUSTER,) the faces seen from the front, of more than `min_area` doubled square pixels, whose bounding
+    box holds a sample."""
+    zero = np.float32(0)
+    for i in range(CLUSTER):
+        xa, ya, xb, yb, xc, yc = screen[0, i], screen[1, i], screen[3, i], screen[4, i], screen[6, i], screen[7, i]
+        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+        x0 = np.ceil(max(min(min(xa, xb), xc), zero))
+        x1 = np.floor(min(max(max(xa, xb), xc), end))
+        y0 = np.ceil(max(min(min(ya, yb), yc), zero))
+        y1 = np.floor(min(max(max(ya, yb), yc), end))
+        flags[i] = (area > min_area) & (x0 <= x1) & (y0 <= y1)
 
 
 @njit(cache=True, error_model="numpy")
-def nearest(faces, first, last, screen, behind, limits, min_area, encoding, depth_buffer, ids):  # type: ignore[no-untyped-def]
-    """Enters faces into a depth buffer and writes their numbers where they are nearest.
+def nearest(
+    drawn, matrices, eyes, spheres, ranges, cones, corners, ranks, limits, min_area, first_wins, inverse_depth, ids
+):  # type: ignore[no-untyped-def]
+    """Enters the faces of some groups into the buffers of inverse depth (H, W) float32 and face numbers (H, W) int32.
 
-    Faces seen from behind are left out.
+    Faces seen from behind, and faces of less than `min_area` doubled square pixels, are left out.
 
     Args:
-        faces: (F, 3) rows of `screen`.
-        first, last: Range of the faces to enter.
-        screen: (V, 3) from `project`.
-        behind: Whether any vertex may lie behind the eye.
-        limits: (near, far), m: nothing nearer or farther is drawn.
-        min_area: Faces whose doubled area in the picture is not larger (square pixels) are left out.
-        encoding: (offset, scale, rank). With scale 0 the buffer holds inverse depth 1 / w, and of two equals the later
-            one stays. Otherwise it holds round(offset + scale / w) * RANKS + rank, as an integer depth buffer does;
-            at equal depth the higher rank stays, at equal rank the earlier face.
-        depth_buffer: (H, W) float32, larger is nearer, 0 for nothing.
-        ids: (H, W) int32 face numbers.
+        drawn: (n,) numbers of groups.
+        matrices: (G, 3, 4) float32 from a group's frame to homogeneous pixels; eyes: (G, 3) the eye in that frame, m.
+        spheres, ranges, cones, corners, ranks: Of the geometry.
+        limits: (near, far) m: nothing nearer or farther is drawn.
+        first_wins: Of two faces at the same distance the one of lower rank is seen, else the one of higher rank.
+        inverse_depth: 1 / w of the nearest face, 0 for none; ids: its number where this call drew it.
     """
-    size = depth_buffer.shape[0]
-    near, far = 1 / limits[0], 1 / limits[1]
+    size = inverse_depth.shape[0]
     zero, end = np.float32(0), np.float32(size - 1)
-    for f in range(first, last):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        if behind and (screen[a, 2] <= 0 or screen[b, 2] <= 0 or screen[c, 2] <= 0):
-            if screen[a, 2] > limits[0] or screen[b, 2] > limits[0] or screen[c, 2] > limits[0]:
-                _clipped(f, a, b, c, screen, limits, min_area, encoding, depth_buffer, ids)
+    screen = np.empty((9, CLUSTER), np.float32)
+    flags = np.zeros(CLUSTER, np.uint8)
+    eights = flags.view(np.uint64)
+    rule = 1 / limits[0], 1 / limits[1], first_wins
+    for g in drawn:
+        matrix = matrices[g]
+        if outside(matrix, spheres[g, 0], spheres[g, 1], spheres[g, 2], spheres[g, 3], size):
             continue
-        xa, ya = screen[a, 0], screen[a, 1]
-        xb, yb = screen[b, 0], screen[b, 1]
-        xc, yc = screen[c, 0], screen[c, 1]
-        # most faces fail one of these tests; a single branch is cheaper than three
-        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-        x0 = int(np.ceil(max(min(xa, xb, xc), zero)))
-        x1 = int(np.floor(min(max(xa, xb, xc), end)))
-        y0 = int(np.ceil(max(min(ya, yb, yc), zero)))
-        y1 = int(np.floor(min(max(ya, yb, yc), end)))
-        if not ((area > min_area) & (x0 <= x1) & (y0 <= y1)):
-            continue
-        wa, wb, wc = screen[a, 2], screen[b, 2], screen[c, 2]
-        corners = xa, ya, wa, xb, yb, wb, xc, yc, wc
-        _fill(f, corners, (x0, x1, y0, y1), near, far, encoding, depth_buffer, ids)
+        for k in range(ranges[g, 0], ranges[g, 1]):
+            dx, dy, dz = cones[k, 0] - eyes[g, 0], cones[k, 1] - eyes[g, 1], cones[k, 2] - eyes[g, 2]
+            away = cones[k, 4] * dx + cones[k, 5] * dy + cones[k, 6] * dz
+            if away >= cones[k, 7] * np.sqrt(dx * dx + dy * dy + dz * dz) + cones[k, 3]:
+                continue
+            behind = _project(corners[k], matrix, screen) <= 0
+            _touch_samples(screen, end, min_area, flags)
+            for eight in range(CLUSTER // 8):
+                if eights[eight] == 0 and not behind:
+                    continue
+                for i in range(8 * eight, 8 * eight + 8):
+                    f = k * CLUSTER + i
+                    wa, wb, wc = screen[2, i], screen[5, i], screen[8, i]
+                    if behind and (wa <= 0 or wb <= 0 or wc <= 0):
+                        if wa > limits[0] or wb > limits[0] or wc > limits[0]:
+                            _clipped(f, i, screen, limits, min_area, rule, ranks, inverse_depth, ids)
+                        continue
+                    if flags[i] == 0:
+                        continue
+                    xa, ya, xb, yb = screen[0, i], screen[1, i], screen[3, i], screen[4, i]
+                    xc, yc = screen[6, i], screen[7, i]
+                    x0 = int(np.ceil(max(min(xa, xb, xc), zero)))
+                    x1 = int(np.floor(min(max(xa, xb, xc), end)))
+                    y0 = int(np.ceil(max(min(ya, yb, yc), zero)))
+                    y1 = int(np.floor(min(max(ya, yb, yc), end)))
+                    _fill(f, xa, ya, wa, xb, yb, wb, xc, yc, wc, x0, x1, y0, y1, rule, ranks, inverse_depth, ids)
 
 
 @njit(cache=True, error_model="numpy")
-def _fill(f, corners, box, near, far, encoding, depth_buffer, ids):  # type: ignore[no-untyped-def]
-    """Enters one face at the samples in `box` (x0, x1, y0, y1); `near` and `far` are inverse depths."""
-    xa, ya, wa, xb, yb, wb, xc, yc, wc = corners
-    x0, x1, y0, y1 = box
+def _fill(f, xa, ya, wa, xb, yb, wb, xc, yc, wc, x0, x1, y0, y1, rule, ranks, inverse_depth, ids):  # type: ignore[no-untyped-def]
     xa, ya, xb, yb, xc, yc = float(xa), float(ya), float(xb), float(yb), float(xc), float(yc)
-    offset, scale, rank = encoding
+    near, far, first_wins = rule
     ia, ib, ic = 0.0, 0.0, 0.0
     for y in range(y0, y1 + 1):
         # Each edge function is linear along the row; faces that share an edge see exactly opposite values there.
@@ -121,49 +148,125 @@ def _fill(f, corners, box, near, far, encoding, depth_buffer, ids):  # type: ign
             eb = eb0 + x * eb1
             ec = ec0 + x * ec1
             if (ea >= 0) & (eb >= 0) & (ec >= 0):
-                if ia == 0.0:  # only now: most small faces contain no sample
+                if ia == 0.0:  # most small faces never come here
                     area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
                     ia, ib, ic = 1 / (area * wa), 1 / (area * wb), 1 / (area * wc)
                 value = np.float32(ea * ia + eb * ib + ec * ic)
-                if value < far or value > near:
+                if value < far or value > near or value < inverse_depth[y, x]:
                     continue
-                if scale == 0:
-                    better = value >= depth_buffer[y, x]
-                else:
-                    value = np.float32(np.floor(offset + scale * value + 0.5) * RANKS + rank)
-                    better = value > depth_buffer[y, x]
-                if better:
-                    depth_buffer[y, x] = value
-                    ids[y, x] = f
+                if value == inverse_depth[y, x]:
+                    other = ids[y, x]
+                    if first_wins and (other == NOTHING or ranks[f] > ranks[other]):
+                        continue
+                    if not first_wins and other != NOTHING and ranks[f] < ranks[other]:
+                        continue
+                inverse_depth[y, x] = value
+                ids[y, x] = f
 
 
 @njit(cache=True, error_model="numpy")
-def _clipped(f, a, b, c, screen, limits, min_area, encoding, depth_buffer, ids):  # type: ignore[no-untyped-def]
-    """Enters the part beyond the near plane of a face that reaches behind the eye."""
+def _clipped(f, i, screen, limits, min_area, rule, ranks, inverse_depth, ids):  # type: ignore[no-untyped-def]
+    """A face that reaches behind the eye: what is left of it beyond the near plane."""
     near = limits[0]
     polygon = np.empty((4, 3), np.float32)
     count = 0
-    vertices = (a, b, c)
     for k in range(3):
-        p, q = vertices[k], vertices[(k + 1) % 3]
-        if screen[p, 2] > near:
-            polygon[count] = screen[p, 0], screen[p, 1], screen[p, 2]
+        p, q = 3 * k, 3 * ((k + 1) % 3)
+        wp, wq = screen[p + 2, i], screen[q + 2, i]
+        if wp > near:
+            polygon[count] = screen[p, i], screen[p + 1, i], wp
             count += 1
-        if (screen[p, 2] > near) != (screen[q, 2] > near):
-            wp, wq = screen[p, 2], screen[q, 2]
+        if (wp > near) != (wq > near):
             t = (near - wp) / (wq - wp)
-            for i in range(2):
-                polygon[count, i] = ((1 - t) * screen[p, i] * wp + t * screen[q, i] * wq) / near
+            for axis in range(2):
+                polygon[count, axis] = ((1 - t) * screen[p + axis, i] * wp + t * screen[q + axis, i] * wq) / near
             polygon[count, 2] = near
             count += 1
-    size = depth_buffer.shape[0]
+    size = inverse_depth.shape[0]
     for k in range(1, count - 1):
-        pa, pb, pc = polygon[0], polygon[k], polygon[k + 1]
-        if not (pb[0] - pa[0]) * (pc[1] - pa[1]) - (pc[0] - pa[0]) * (pb[1] - pa[1]) > min_area:
-            continue  # also rejects NaN: a corner level with the eye
-        x0 = int(np.ceil(max(min(pa[0], pb[0], pc[0]), 0)))
-        x1 = int(np.floor(min(max(pa[0], pb[0], pc[0]), size - 1)))
-        y0 = int(np.ceil(max(min(pa[1], pb[1], pc[1]), 0)))
-        y1 = int(np.floor(min(max(pa[1], pb[1], pc[1]), size - 1)))
-        corners = pa[0], pa[1], pa[2], pb[0], pb[1], pb[2], pc[0], pc[1], pc[2]
-        _fill(f, corners, (x0, x1, y0, y1), np.inf, 1 / limits[1], encoding, depth_buffer, ids)
+        a, b, c = polygon[0], polygon[k], polygon[k + 1]
+        # also rejects NaN: a corner level with the eye
+        if not (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]) > min_area:
+            continue
+        x0 = int(np.ceil(max(min(a[0], b[0], c[0]), 0)))
+        x1 = int(np.floor(min(max(a[0], b[0], c[0]), size - 1)))
+        y0 = int(np.ceil(max(min(a[1], b[1], c[1]), 0)))
+        y1 = int(np.floor(min(max(a[1], b[1], c[1]), size - 1)))
+        unlimited = np.float32(np.inf), rule[1], rule[2]
+        _fill(
+            f,
+            a[0],
+            a[1],
+            a[2],
+            b[0],
+            b[1],
+            b[2],
+            c[0],
+            c[1],
+            c[2],
+            x0,
+            x1,
+            y0,
+            y1,
+            unlimited,
+            ranks,
+            inverse_depth,
+            ids,
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def cast(drawn, matrices, toward, ranges, cones, corners, heights, touched):  # type: ignore[no-untyped-def]
+    """Enters the back faces of some groups into a shadow map (S, S) float32 of heights towards the light, m.
+
+    Args:
+        drawn: (n,) numbers of groups.
+        matrices: (G, 3, 4) float32 from a group's frame to column, row and height; the columns run the other way, so
+            that faces that turn their back to the light come out as fronts.
+        toward: (G, 3) unit vector to the light in the group's frame.
+        ranges, cones, corners: Of the geometry.
+        touched: (4,) int64 first and last column, first and last row that were written; grown here.
+    """
+    size = heights.shape[0]
+    zero, end = np.float32(0), np.float32(size - 1)
+    screen = np.empty((9, CLUSTER), np.float32)
+    flags = np.zeros(CLUSTER, np.uint8)
+    eights = flags.view(np.uint64)
+    for g in drawn:
+        for k in range(ranges[g, 0], ranges[g, 1]):
+            lit = cones[k, 4] * toward[g, 0] + cones[k, 5] * toward[g, 1] + cones[k, 6] * toward[g, 2]
+            if lit >= cones[k, 7]:
+                continue
+            _project_flat(corners[k], matrices[g], screen)
+            _touch_samples(screen, end, zero, flags)
+            for eight in range(CLUSTER // 8):
+                if eights[eight] == 0:
+                    continue
+                for i in range(8 * eight, 8 * eight + 8):
+                    if flags[i] != 0:
+                        _fill_heights(i, screen, zero, end, heights, touched)
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_heights(i, screen, zero, end, heights, touched):  # type: ignore[no-untyped-def]
+    xa, ya, xb, yb, xc, yc = screen[0, i], screen[1, i], screen[3, i], screen[4, i], screen[6, i], screen[7, i]
+    x0 = int(np.ceil(max(min(xa, xb, xc), zero)))
+    x1 = int(np.floor(min(max(xa, xb, xc), end)))
+    y0 = int(np.ceil(max(min(ya, yb, yc), zero)))
+    y1 = int(np.floor(min(max(ya, yb, yc), end)))
+    share = 1 / ((xb - xa) * (yc - ya) - (xc - xa) * (yb - ya))
+    za, zb, zc = screen[2, i] * share, screen[5, i] * share, screen[8, i] * share
+    for y in range(y0, y1 + 1):
+        ea0, ea1 = xb * (yc - y) - xc * (yb - y), yb - yc
+        eb0, eb1 = xc * (ya - y) - xa * (yc - y), yc - ya
+        ec0, ec1 = xa * (yb - y) - xb * (ya - y), ya - yb
+        for x in range(x0, x1 + 1):
+            ea = ea0 + x * ea1
+            eb = eb0 + x * eb1
+            ec = ec0 + x * ec1
+            if (ea >= 0) & (eb >= 0) & (ec >= 0):
+                height = ea * za + eb * zb + ec * zc
+                if height > heights[y, x]:
+                    heights[y, x] = height
+    touched[0], touched[1] = min(touched[0], x0), max(touched[1], x1)
+    touched[2], touched[3] = min(touched[2], y0), max(touched[3], y1)

@@ -1,16 +1,16 @@
-"""`renderer="fast"`: the pictures that PyBullet's TinyRenderer draws."""
+"""`renderer="tiny"`: the pictures that PyBullet's TinyRenderer draws."""
 
 import numpy as np
 
 from . import shading
-from .fast import FastRenderer, pack
+from .software import Frame, Layer, SoftwareRenderer, pack
 from .stage import Stage
 
 LIGHT = np.array([-50.0, 30.0, 100.0]) / np.linalg.norm([-50.0, 30.0, 100.0])
 """Direction to TinyRenderer's light."""
 
 
-class TinyLook(FastRenderer):
+class TinyLook(SoftwareRenderer):
     """Nearest texels, one distant light, no shadows, white background."""
 
     min_area = np.float32(0.01)
@@ -22,25 +22,22 @@ class TinyLook(FastRenderer):
         self._textures = np.zeros((len(images), 3), np.int64)
         self._textures[[image is not None for image in images]] = table
 
-    def _blank(self, size: int) -> np.ndarray:
-        return np.full((size, size, 3), 255, np.uint8)
-
-    def _shade(self, ids: np.ndarray, poses: np.ndarray, colors: np.ndarray, canvas: np.ndarray) -> None:
-        rotations = poses[self._groups, :3, :3]
+    def _shade(
+        self, ids: np.ndarray, matrices: np.ndarray, rgba: np.ndarray, frame: Frame, layer: Layer | None
+    ) -> None:
+        rotations, geometry = frame.poses[self._groups, :3, :3], self._geometry
         shading.shade_tiny(
             ids,
-            self._faces,
-            self._screen,
-            self._owner,
-            self._normals,
-            self._uvs,
+            geometry.corners,
+            matrices,
+            geometry.shapes,
+            self._groups,
+            geometry.normals,
+            geometry.uvs,
             self._textures,
             self._texels,
-            colors,
+            rgba,
             LIGHT @ rotations,
             rotations[:, 2],
-            canvas,
+            frame.picture,
         )
-
-    def _finish(self, canvas: np.ndarray, depth_buffer: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        return canvas

@@ -106,7 +106,9 @@ def _shape(kind: int, size: tuple[float, ...], file: str, round_boxes: bool) -> 
         ring = np.stack([radius * np.sin(angles), radius * np.cos(angles)], 1)
         corners = np.concatenate([np.insert(ring, 2, z, 1) for z in (length / 2, -length / 2)])
         return _hull(corners[(_directions() @ corners.T).argmax(1)] + _MARGIN * _directions()), one
-    raise DeskError(f"a visual shape of Bullet's kind {kind} cannot be drawn; choose renderer tiny or egl")
+    raise DeskError(
+        f"a visual shape of Bullet's kind {kind} cannot be drawn; choose renderer pybullet_tiny or pybullet_gl"
+    )
 
 
 @cache
@@ -121,7 +123,7 @@ def load_mesh(file: str) -> Mesh:
         return _load_obj(path)
     if path.suffix.lower() == ".stl":
         return _load_stl(path)
-    raise DeskError(f"{file}: expected an .obj or .stl mesh; choose renderer tiny or egl for others")
+    raise DeskError(f"{file}: expected an .obj or .stl mesh; choose renderer pybullet_tiny or pybullet_gl for others")
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):
