@@ -70,8 +70,8 @@ class RecordConfig:
     variety: float = 1.0
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
-    # What draws the pictures: fast, fast_gl (the look of CALVIN's public data), tiny or egl.
-    renderer: str = "fast"
+    # What draws the pictures: gl (the look of CALVIN's public data), tiny, pybullet_gl or pybullet_tiny.
+    renderer: str = "gl"
     # YAML of sentences by task for each split; our own by default.
     annotations: str | None = None
     validation_annotations: str | None = None

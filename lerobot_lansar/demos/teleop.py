@@ -61,8 +61,8 @@ class TeleopConfig:
     scene: str = "D"
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
-    # fast, fast_gl, tiny or egl.
-    renderer: str = "fast"
+    # gl, tiny, pybullet_gl or pybullet_tiny.
+    renderer: str = "gl"
     # Start in a random state in which this task is feasible; everything closed and off by default.
     task: str | None = None
     seed: int = 0

@@ -128,7 +128,7 @@ def test_demonstrations_on_the_original_desk_look_like_it(original_assets, tmp_p
                 validation_episodes=1,
                 cameras=["static", "gripper"],
                 assets=assets,
-                renderer="fast_gl",
+                renderer="tiny",
             )
         )
         config = yaml.safe_load((made[assets] / "training/.hydra/merged_config.yaml").read_text())
