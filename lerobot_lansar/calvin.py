@@ -180,3 +180,22 @@ def _tasks() -> list[Task]:
 
 TASKS: dict[str, Task] = {task.name: task for task in _tasks()}
 """The 34 tasks by name; a task's number in a dataset is its place here."""
+
+
+def _task_groups() -> dict[str, tuple[str, ...]]:
+    kinds = {
+        "rotate": ("rotate_block",),
+        "push": ("push_block", "push_into_drawer"),
+        "slider": ("move_slider",),
+        "drawer": ("open_drawer", "close_drawer"),
+        "lift": ("lift_block",),
+        "place": ("place_block",),
+        "stack": ("stack_block", "unstack_block"),
+        "lights": ("turn_on_lightbulb", "turn_off_lightbulb", "turn_on_led", "turn_off_led"),
+    }
+    return {group: tuple(t.name for t in TASKS.values() if t.kind in kinds[group]) for group in kinds}
+
+
+TASK_GROUPS: dict[str, tuple[str, ...]] = _task_groups()
+"""Names for several tasks at once; each of the 34 is in one group. A task's number in LeRobot's results is its place
+in its group."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..benchmark import EPISODES_FILE, LH_MTLC, load_chains
-from ..calvin import CHAIN_LENGTH, TASKS
+from ..calvin import CHAIN_LENGTH, TASK_GROUPS, TASKS
 
 DEFAULT_SEED = 1000
 """LeRobot's own default of `--seed`."""
@@ -23,6 +23,7 @@ SETTINGS = (
     "renderer",
     "control_mode",
     "steps_per_command",
+    "sentence",
     "perturbation_every",
     "perturbation_scale",
 )
@@ -38,12 +39,14 @@ class Episode:
         seed: The episode's reset seed.
         chain: Number of the chain, or None for a single task.
         settings: The known ones of `SETTINGS`.
+        reason: Why it ended before its time: an action that the desk refused, or a simulation that diverged.
     """
 
     commands: list[tuple[str, bool]]
     seed: int
     chain: int | None
     settings: dict[str, Any] = field(default_factory=dict)
+    reason: str | None = None
 
     @property
     def successes(self) -> int:
@@ -55,7 +58,8 @@ def read_eval_info(eval_dir: Path) -> list[dict[str, Any]]:
     """Reads the evaluated environments' entries of `eval_info.json`.
 
     Returns:
-        [{"task_group": str, "sum_rewards": [number per episode]}].
+        [{"task_group": str, "task_id": int, "sum_rewards": [number per episode]}]. The group is a suite of
+        `--env.task`, and the id the task's number in it.
 
     Raises:
         FileNotFoundError: The evaluation has not finished, or its folder is another one.
@@ -68,7 +72,11 @@ def read_eval_info(eval_dir: Path) -> list[dict[str, Any]]:
         )
     try:
         entries = [
-            {"task_group": str(entry["task_group"]), "sum_rewards": list(entry["metrics"]["sum_rewards"])}
+            {
+                "task_group": str(entry["task_group"]),
+                "task_id": int(entry["task_id"]),
+                "sum_rewards": list(entry["metrics"]["sum_rewards"]),
+            }
             for entry in json.loads(path.read_text())["per_task"]
         ]
     except (ValueError, KeyError, TypeError) as error:
@@ -103,7 +111,7 @@ def _from_line(line: dict[str, Any]) -> Episode:
     if not commands:
         raise ValueError("no command")
     settings = {key: line[key] for key in SETTINGS if key in line}
-    return Episode(commands, int(line["seed"]), line["chain"], settings)
+    return Episode(commands, int(line["seed"]), line["chain"], settings, line.get("reason"))
 
 
 def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | None) -> list[Episode]:
@@ -122,9 +130,8 @@ def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | Non
     """
     episodes = []
     for entry in entries:
-        group = entry["task_group"]
-        task = group if group in TASKS else None
-        own = _lines_of(group, lines)
+        task = _task_of(entry)
+        own = _lines_of(task or entry["task_group"], lines)
         by_seed: dict[int, Episode] = {}
         for line in own:
             if by_seed.setdefault(line.seed, line) != line:
@@ -145,11 +152,19 @@ def collect(entries: list[dict[str, Any]], lines: list[Episode], seed: int | Non
     return episodes
 
 
-def _lines_of(group: str, lines: list[Episode]) -> list[Episode]:
-    """The lines of a task group: of a single task, of the chains, or all of them if the group has another name."""
-    if group in TASKS:
-        return [line for line in lines if line.chain is None and line.commands[0][0] == group]
-    if group == LH_MTLC:
+def _task_of(entry: dict[str, Any]) -> str | None:
+    """The task that an entry of `read_eval_info` is about; None for chains and for groups of another name."""
+    group = entry["task_group"]
+    if group in TASK_GROUPS:
+        return TASK_GROUPS[group][entry["task_id"]]
+    return group if group in TASKS else None
+
+
+def _lines_of(name: str, lines: list[Episode]) -> list[Episode]:
+    """The lines of a task, or of the chains; all lines if the name is neither."""
+    if name in TASKS:
+        return [line for line in lines if line.chain is None and line.commands[0][0] == name]
+    if name == LH_MTLC:
         return [line for line in lines if line.chain is not None]
     return lines
 
@@ -171,10 +186,10 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
     """Computes every figure of the report.
 
     Returns:
-        {"episodes", "seeds": [first, last], "settings", "tasks": {task: {"successes", "attempts", "rate"}},
-        "local_success_rate"} and, for chains, {"in_a_row": [share with at least 1…5], "average_length"}. The
-        average length is the sum of the five shares; the local success rate is the share of attempted commands
-        that were fulfilled.
+        {"episodes", "ended_early", "seeds": [first, last], "settings", "tasks": {task: {"successes", "attempts",
+        "rate"}}, "local_success_rate"} and, for chains, {"in_a_row": [share with at least 1…5], "average_length"}.
+        The average length is the sum of the five shares; the local success rate is the share of attempted commands
+        that were fulfilled. Episodes that `ended_early` have a `reason`.
     """
     tasks: dict[str, dict[str, Any]] = {}
     for name, fulfilled in (command for episode in episodes for command in episode.commands):
@@ -185,6 +200,7 @@ def summarise(episodes: list[Episode]) -> dict[str, Any]:
         counts["rate"] = counts["successes"] / counts["attempts"]
     summary: dict[str, Any] = {
         "episodes": len(episodes),
+        "ended_early": sum(e.reason is not None for e in episodes),
         "seeds": [min(e.seed for e in episodes), max(e.seed for e in episodes)],
         "settings": {key: _agreed(e.settings.get(key) for e in episodes) for key in SETTINGS},
         "tasks": dict(sorted(tasks.items(), key=lambda item: (-item[1]["rate"], item[0]))),

@@ -116,6 +116,19 @@ def test_single_tasks_with_lines_and_equal_seeds_are_kept_apart(tmp_path):
     }
 
 
+@pytest.mark.parametrize("with_lines", [True, False])
+def test_a_suites_entries_are_reported_by_task(tmp_path, with_lines):
+    folder = write_eval(tmp_path, ("drawer", [1.0, 0.0]), ("drawer", [0.0, 0.0]))
+    if with_lines:
+        write_lines(folder, [(s, None, [("close_drawer", False)]) for s in (7, 8)])
+        write_lines(folder, [(s, None, [("open_drawer", s == 7)]) for s in (7, 8)])
+    tasks = report(ReportConfig(folder))["tasks"]
+    assert {task: (c["successes"], c["attempts"]) for task, c in tasks.items()} == {
+        "open_drawer": (1, 2),
+        "close_drawer": (0, 2),
+    }
+
+
 def test_lines_tell_the_task_of_a_group_with_another_name(tmp_path):
     folder = write_eval(tmp_path, ("calvin", [1.0, 0.0]))
     write_lines(folder, [(0, None, [("open_drawer", True)]), (1, None, [("open_drawer", False)])])
@@ -135,6 +148,16 @@ def test_lines_give_the_settings_and_surplus_episodes_do_not_count(tmp_path):
     assert summary["seeds"] == [50, 51]
     expected = {"scene": "D", "assets": "built-in", "control_mode": "rel", "steps_per_command": 360}
     assert {key: value for key, value in summary["settings"].items() if value is not None} == expected
+
+
+def test_episodes_that_ended_before_their_time_are_counted(tmp_path):
+    folder = write_eval(tmp_path, ("calvin", [0.0, 0.0]))
+    write_lines(folder, [(0, 0, [("open_drawer", False)])], reason=None, sentence="random")
+    write_lines(folder, [(1, 1, [("turn_on_led", False)])], reason="simulation diverged", sentence="random")
+    summary = report(ReportConfig(folder))
+    assert summary["ended_early"] == 1
+    assert summary["settings"]["sentence"] == "random"
+    assert any(note.startswith("1 episodes failed because the desk refused") for note in summary["notes"])
 
 
 def test_lines_of_another_evaluation_are_noticed(tmp_path):
