@@ -2,8 +2,12 @@
 
 calvin                  `CalvinEnv`: chains of the benchmark or single tasks, rewards, ends of episodes
 spaces                  its observation and action spaces
+control_mode            refuses an episode's first action if it plainly belongs to the other control mode
 episodes                `episodes.jsonl`: one line per finished episode, which the report reads
-configuration_calvin    `CalvinEnvConfig`: the options in LeRobot's commands, and vector environments
+configuration_calvin    `CalvinEnvConfig`: the options in LeRobot's commands
+suites                  what `--env.task` stands for
+command_line            refuses what LeRobot's other options make impossible
+vector                  vector environments: forked workers, finished episodes freeze
 """
 
 from .calvin import LH_MTLC, CalvinEnv

@@ -1,6 +1,7 @@
 """The CALVIN desk as a gymnasium environment: the long-horizon benchmark, or one task at a time."""
 
 import functools
+import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -10,21 +11,21 @@ import gymnasium as gym
 import numpy as np
 
 from ..benchmark import LH_MTLC, load_chains
-from ..calvin import CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS
+from ..calvin import CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS, continuous_euler
 from ..desk import Desk, DeskError, Observation, SimulationError, Snapshot, is_fulfilled
 from ..desk.render import RENDERERS
 from ..desk.sentences import load_commands
 from ..desk.starts import sample_start
+from .control_mode import refuse_other_mode
 from .episodes import append_episode
 from .spaces import ACTION_SIZE, action_space, observation_space
 
-_PERTURBATION_STREAM = (4, 9)  # with an episode's seed: a generator apart from the one that draws its start
+# With an episode's seed: generators apart from the one that draws its start.
+_PERTURBATION_STREAM = (4, 9)
+_SENTENCE_STREAM = (1,)
 
-# What tells the control modes apart at an episode's first action. The hand points down then, so an absolute roll is
-# near +-pi; a relative roll is nominally within +-1.
-_RELATIVE_ROLL = 1.0  # largest absolute value (units of 0.05 rad)
-_ABSOLUTE_ROLL = 2.0  # smallest absolute value (rad)
-_ABSOLUTE_HEIGHT = (0.2, 1.2)  # of the TCP (m)
+SENTENCE_CHOICES = ("first", "random")
+"""Which of a task's sentences commands it."""
 
 
 class CalvinEnv(gym.Env):
@@ -37,13 +38,14 @@ class CalvinEnv(gym.Env):
 
     Action space (7,) at 30 Hz:
         `control_mode="rel"`: TCP translation in units of 0.02 m and rotation (euler xyz) in units of 0.05 rad, both
-        nominally within +-1 and added to a target pose, then the gripper. `"abs"`: TCP xyz (m), euler xyz (rad),
-        gripper. A positive gripper command opens, any other closes.
+        nominally within +-1 and added to a target pose, then the gripper. `"abs"`: TCP xyz (m), euler xyz (rad, with
+        any number of full turns), gripper. A positive gripper command opens, any other closes.
 
     Observation space:
-        `agent_pos` (15,): CALVIN's robot_obs. `environment_state` (24,): CALVIN's scene_obs, blocks in red, blue,
-        pink order; privileged simulator state (58 numbers with `task_in_state`). `pixels`: the pictures named by
-        `cameras`, `static` (200, 200, 3) and `gripper` (84, 84, 3) uint8. `control_mode` (1,): 0 relative,
+        `agent_pos` (15,): CALVIN's robot_obs, but with the euler angles of `continuous_euler`, as in the datasets of
+        this package: they do not jump where the arm works. `environment_state` (24,): CALVIN's scene_obs, blocks in
+        red, blue, pink order; privileged simulator state (58 numbers with `task_in_state`). `pixels`: the pictures
+        named by `cameras`, `static` (200, 200, 3) and `gripper` (84, 84, 3) uint8. `control_mode` (1,): 0 relative,
         1 absolute; policies check it.
 
     Rewards: 1 for each fulfilled command, judged by CALVIN's oracle after every step; 0 otherwise. The return of a
@@ -55,8 +57,9 @@ class CalvinEnv(gym.Env):
         environment's own generator draws one.
 
     Episode end: terminated when the last command is fulfilled, or when a command is not fulfilled within
-        `steps_per_command` control steps (360 in CALVIN). An episode whose simulation diverges has failed; its last
-        observation is the last finite one.
+        `steps_per_command` control steps (360 in CALVIN). An action that the desk refuses (not finite, or beyond
+        +-100) and a simulation that diverges also end the episode as failed; the observation is then the last one
+        before. `reason` in `episodes.jsonl` says what happened.
 
     Args:
         task: `"lh_mtlc"` or one of the 34 tasks.
@@ -66,8 +69,10 @@ class CalvinEnv(gym.Env):
         control_mode: `"rel"` or `"abs"`.
         steps_per_command: Control steps that a command may take.
         annotations: YAML file of sentences by task (CALVIN's format); our own by default.
+        sentence: `"first"`: a task is commanded by the first of its sentences, as in CALVIN. `"random"`: by any of
+            them; the draws depend on the episode's seed.
         results_dir: If given, a line is appended to `episodes.jsonl` in it for every finished episode.
-        renderer: `"fast"`, `"fast_gl"` (the look of CALVIN's public data), `"tiny"` or `"egl"`; see `Desk`.
+        renderer: `"gl"` (the look of CALVIN's public data), `"tiny"`, `"pybullet_gl"` or `"pybullet_tiny"`; see `Desk`.
         perturbation_every: If not 0, every `perturbation_every`-th action is perturbed: each coordinate of its
             position difference is replaced by a draw from the normal distribution around it whose standard deviation
             is `perturbation_scale` times its size (Eq 4.9 of the thesis; its experiments are 50 and 5, 25 and 2.5,
@@ -93,8 +98,9 @@ class CalvinEnv(gym.Env):
         control_mode: str = "rel",
         steps_per_command: int = STEPS_PER_COMMAND,
         annotations: str | None = None,
+        sentence: str = "first",
         results_dir: str | None = None,
-        renderer: str = "fast",
+        renderer: str = "gl",
         perturbation_every: int = 0,
         perturbation_scale: float = 0.0,
         render_fps: int = CONTROL_HZ,
@@ -105,10 +111,13 @@ class CalvinEnv(gym.Env):
         _check_numbers(steps_per_command, render_fps, perturbation_every, perturbation_scale)
         if control_mode not in CONTROL_MODES:
             raise DeskError(f"control_mode {control_mode!r} is unknown; it is 'rel' or 'abs'")
+        if sentence not in SENTENCE_CHOICES:
+            raise DeskError(f"sentence {sentence!r} is unknown; it is 'first' or 'random'")
         if renderer not in RENDERERS:
             raise DeskError(f"renderer {renderer!r} is unknown; choose among {', '.join(RENDERERS)}")
         self.task = task
         self.control_mode = control_mode
+        self.sentence = sentence
         self.steps_per_command = steps_per_command
         self.perturbation_every, self.perturbation_scale = perturbation_every, perturbation_scale
         self.task_in_state = task_in_state
@@ -125,7 +134,7 @@ class CalvinEnv(gym.Env):
         self._desk: Desk | None = None  # opened at the first reset, in the process that steps it
         self._commands: tuple[str, ...] = ()  # tasks of the episode; empty when none is under way
         self._outcomes: list[dict[str, Any]] = []  # of the commands that ended, in order
-        self._diverged = False
+        self._reason: str | None = None  # why the episode ended before its time
         self._last: Observation = {}
 
     def reset(
@@ -135,7 +144,7 @@ class CalvinEnv(gym.Env):
         super().reset(seed=seed)
         if self._desk is None:
             self._desk = self._open_desk()
-        self._diverged = False
+        self._reason = None
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         if self.task == LH_MTLC:
             chains = load_chains()
@@ -148,6 +157,7 @@ class CalvinEnv(gym.Env):
             self._commands = (self.task,)
             start = sample_start(self._desk, self.task, np.random.default_rng(self._seed))
             self._last = self._desk.reset(*start)
+        self._choices = np.random.default_rng([self._seed, *_SENTENCE_STREAM])
         self._perturbations = np.random.default_rng([self._seed, *_PERTURBATION_STREAM])
         self._outcomes = []
         self._picture: tuple[int, np.ndarray] | None = None  # the step it was drawn at, and the static picture
@@ -159,19 +169,16 @@ class CalvinEnv(gym.Env):
         """One control step of 1/30 s.
 
         Raises:
-            DeskError: The environment was not reset; the action is not (7,) and finite; an episode's first action
-                plainly belongs to the other control mode.
+            DeskError: The environment was not reset; the action is not (7,); an episode's first action plainly
+                belongs to the other control mode.
         """
         if self._desk is None or not self._commands:
             raise DeskError("reset the environment before stepping it")
-        if self._steps == 0:
-            self._refuse_other_mode(np.asarray(action, dtype=np.float64))
+        if self._steps == 0 and _is_action(action):
+            refuse_other_mode(np.asarray(action, dtype=np.float64), self.control_mode)
         if self.perturbation_every and (self._steps + 1) % self.perturbation_every == 0:
             action = self._perturbed(np.array(action, dtype=np.float64))
-        try:
-            self._last = self._desk.step(action, self.control_mode)
-        except SimulationError:  # costs this episode only; the next reset starts the desk anew
-            self._diverged = True
+        self._advance(self._desk, action)
         self._steps += 1
         self._command_steps += 1
         fulfilled, finished = self._judge()
@@ -183,11 +190,28 @@ class CalvinEnv(gym.Env):
             self._begin_command()
         return self._observation(), float(fulfilled), finished, False, info
 
+    def _advance(self, desk: Desk, action: Any) -> None:
+        """Moves the desk. What goes wrong there costs this episode only; the next reset starts the desk anew."""
+        try:
+            self._last = desk.step(action, self.control_mode)
+        except SimulationError:
+            self._reason = "simulation diverged"
+        except DeskError as error:
+            if np.shape(action) != (ACTION_SIZE,):  # would fail every episode
+                raise
+            self._reason = str(error)
+        if self._reason is not None:
+            warnings.warn(
+                "episodes fail early: the desk refuses the policy's actions, or its simulation diverges. With "
+                "--env.results_dir, episodes.jsonl holds each episode's reason",
+                stacklevel=3,
+            )
+
     def render(self) -> np.ndarray:  # type: ignore[override]
         """The static camera's picture, (200, 200, 3) uint8."""
         if self._desk is None:
             raise DeskError("reset the environment before rendering it")
-        if self._diverged and self._picture is not None:
+        if self._reason is not None and self._picture is not None:
             return self._picture[1]
         if self._picture is None or self._steps - self._picture[0] >= self._redraw_every:
             self._picture = (self._steps, self._desk.render("static"))
@@ -208,14 +232,17 @@ class CalvinEnv(gym.Env):
         assert self._desk is not None
         self._start: Snapshot = self._desk.snapshot()
         self._command_steps = 0
-        self.task_description = self._sentences[self._current][0]
+        sentences = self._sentences[self._current]
+        chosen = int(self._choices.integers(len(sentences))) if self.sentence == "random" else 0
+        self.task_description = sentences[chosen]
         self._task_one_hot = np.array([task == self._current for task in TASKS], dtype=np.float64)
 
     def _judge(self) -> tuple[bool, bool]:
         """Whether the last step fulfilled the command, and whether it ended the episode; notes how a command ended."""
         assert self._desk is not None
-        fulfilled = not self._diverged and is_fulfilled(self._current, self._start, self._desk.snapshot())
-        failed = self._diverged or (not fulfilled and self._command_steps >= self.steps_per_command)
+        ended_early = self._reason is not None
+        fulfilled = not ended_early and is_fulfilled(self._current, self._start, self._desk.snapshot())
+        failed = ended_early or (not fulfilled and self._command_steps >= self.steps_per_command)
         if fulfilled or failed:
             self._outcomes.append(
                 {
@@ -228,7 +255,7 @@ class CalvinEnv(gym.Env):
         return fulfilled, failed or len(self._outcomes) == len(self._commands)
 
     def _perturbed(self, action: np.ndarray) -> np.ndarray:
-        """Eq 4.9. The desk rejects an action that is not (7,) and finite, so that is returned unchanged."""
+        """Eq 4.9. The desk refuses an action that is not (7,) and finite, so that is returned unchanged."""
         if _is_action(action):
             origin = self._last["robot_obs"][:3] if self.control_mode == "abs" else 0.0
             delta = action[:3] - origin
@@ -236,9 +263,10 @@ class CalvinEnv(gym.Env):
         return action
 
     def _observation(self) -> dict[str, Any]:
-        state = self._last["scene_obs"]
+        state, robot = self._last["scene_obs"], self._last["robot_obs"].copy()
+        robot[3:6] = continuous_euler(robot[3:6])
         observation: dict[str, Any] = {
-            "agent_pos": self._last["robot_obs"],
+            "agent_pos": robot,
             "environment_state": np.concatenate([state, self._task_one_hot]) if self.task_in_state else state,
             "control_mode": np.array([CONTROL_MODES.index(self.control_mode)], dtype=np.float32),
         }
@@ -259,23 +287,6 @@ class CalvinEnv(gym.Env):
         """How many commands the episode has fulfilled."""
         return sum(outcome["success"] for outcome in self._outcomes)
 
-    def _refuse_other_mode(self, action: np.ndarray) -> None:
-        """Raises DeskError at a first action of the other control mode, before it costs an evaluation."""
-        if not _is_action(action):
-            return  # the desk says what is wrong
-        height, roll = action[2], action[3]
-        low, high = _ABSOLUTE_HEIGHT
-        if self.control_mode == "rel" and abs(roll) > _ABSOLUTE_ROLL and low < height < high:
-            looks, other = f"absolute: height {height:.2f} m and roll {roll:.2f} rad", "abs"
-        elif self.control_mode == "abs" and abs(roll) <= _RELATIVE_ROLL:
-            looks, other = f"relative: as an absolute one, roll {roll:.2f} rad would point the hand up", "rel"
-        else:
-            return
-        raise DeskError(
-            f"the environment takes control_mode={self.control_mode!r} actions, but the policy's first action looks "
-            f"{looks}. Set --env.control_mode={other}, or use a policy trained on {self.control_mode!r} actions"
-        )
-
     def _write_result(self) -> None:
         if self._results_dir is None:
             return
@@ -286,10 +297,12 @@ class CalvinEnv(gym.Env):
             "scene": self._desk.scene.name,
             "commands": self._outcomes,
             "successes": self._successes(),
+            "reason": self._reason,
             "assets": self._desk.assets,
             "renderer": self._desk.renderer if self._desk.cameras else None,
             "control_mode": self.control_mode,
             "steps_per_command": self.steps_per_command,
+            "sentence": self.sentence,
             "perturbation_every": self.perturbation_every,
             "perturbation_scale": self.perturbation_scale,
             "version": version("lerobot_policy_lansar"),
@@ -297,8 +310,8 @@ class CalvinEnv(gym.Env):
         append_episode(self._results_dir, episode)
 
 
-def _is_action(action: np.ndarray) -> bool:
-    return action.shape == (ACTION_SIZE,) and bool(np.isfinite(action).all())
+def _is_action(action: Any) -> bool:
+    return np.shape(action) == (ACTION_SIZE,) and bool(np.isfinite(action).all())
 
 
 def _check_task(task: str, scene: str) -> None:

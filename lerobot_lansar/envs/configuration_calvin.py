@@ -1,21 +1,23 @@
-"""`--env.type=calvin`: the options of the CALVIN desk in LeRobot's commands, and its vector environments."""
+"""`--env.type=calvin`: the options of the CALVIN desk in LeRobot's commands."""
 
 import functools
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from ..benchmark import LH_MTLC
 from ..calvin import CAMERAS, CONTROL_HZ, ROBOT_OBS_NAMES, STEPS_PER_COMMAND
 from ..desk import Desk, DeskError
+from ..desk.render import OURS
 from .calvin import CalvinEnv
+from .command_line import check_environment_state, refuse_recording
 from .spaces import ACTION_SIZE, environment_state_size
+from .suites import suites
+from .vector import ForkedVectorEnv, SerialVectorEnv
 
 
 @EnvConfig.register_subclass("calvin")
@@ -23,10 +25,11 @@ from .spaces import ACTION_SIZE, environment_state_size
 class CalvinEnvConfig(EnvConfig):
     """The CALVIN desk. The comment above each option is its help text; `CalvinEnv` documents the environment."""
 
-    # lh_mtlc for the benchmark's chains, a task's name, or several names separated by commas: LeRobot then evaluates
-    # one after the other, --eval.n_episodes each.
+    # lh_mtlc for the benchmark's chains, a task's name, a group (rotate, push, slider, drawer, lift, place, stack,
+    # lights), all for the 34 tasks, or several of these separated by commas. LeRobot evaluates one task after the
+    # other, --eval.n_episodes each.
     task: str | None = LH_MTLC
-    # Control steps per second, for LeRobot's information: the desk always runs at 30.
+    # Control steps per second: 30, nothing else.
     fps: int = CONTROL_HZ
     # A, B, C or D; the benchmark is defined on D.
     scene: str = "D"
@@ -40,10 +43,12 @@ class CalvinEnvConfig(EnvConfig):
     steps_per_command: int = STEPS_PER_COMMAND
     # YAML file of sentences by task, in CALVIN's format; by default our own sentences, held out for evaluation.
     annotations: str | None = None
+    # Which sentence commands a task: first, as in CALVIN, or random, drawn anew for each command by the episode's seed.
+    sentence: str = "first"
     # Folder in which a line is appended to episodes.jsonl for every finished episode; use a new one per evaluation.
     results_dir: str | None = None
-    # fast, fast_gl (the look of CALVIN's public data), or PyBullet's own: tiny, egl.
-    renderer: str = "fast"
+    # gl (the look of CALVIN's public data), tiny (TinyRenderer's look), or PyBullet's own: pybullet_gl, pybullet_tiny.
+    renderer: str = "gl"
     # Perturb the position difference of every perturbation_every-th action; needs perturbation_scale. 0: none.
     perturbation_every: int = 0
     # Standard deviation of that perturbation, as a multiple of the action's own position difference.
@@ -60,6 +65,12 @@ class CalvinEnvConfig(EnvConfig):
                 "--env.max_parallel_tasks must be 1: LeRobot's parallel tasks share one policy object, which would "
                 "mix the episodes' histories"
             )
+        if self.fps != CONTROL_HZ:
+            raise DeskError(
+                f"--env.fps must be {CONTROL_HZ}, got {self.fps}: the desk makes {CONTROL_HZ} control steps per "
+                "second, as CALVIN does. --env.render_fps sets how many pictures per second the videos have"
+            )
+        self._suites()
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_SIZE,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(ROBOT_OBS_NAMES),)),
@@ -88,6 +99,7 @@ class CalvinEnvConfig(EnvConfig):
             "control_mode",
             "steps_per_command",
             "annotations",
+            "sentence",
             "results_dir",
             "renderer",
             "perturbation_every",
@@ -97,38 +109,36 @@ class CalvinEnvConfig(EnvConfig):
         )
         return {name: getattr(self, name) for name in names}
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector environment per task: `{task: {0: environment}}`.
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """Processors that change nothing. LeRobot asks for them before the first step, in training too.
 
-        Finished episodes freeze instead of being simulated further. Workers are forked, as a fresh interpreter would
-        import all of LeRobot (20 s and 0.9 GB each): those of the first task here, which in `lerobot-eval` is before
-        the policy exists, those of the others when their turn comes.
+        Raises:
+            DeskError: The command's policy was trained with another `environment_state`: `--env.task_in_state` was
+                forgotten, or is too much. Or the command records episodes whose sentences LeRobot would mix up.
         """
-        tasks = [task.strip() for task in (self.task or LH_MTLC).split(",")]
-        makers = {task: [functools.partial(CalvinEnv, task=task, **self.gym_kwargs)] * n_envs for task in tasks}
+        if self.sentence == "random" or LH_MTLC in self._suites():
+            refuse_recording()
+        check_environment_state(self.task_in_state)
+        return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[])
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """One vector environment per task: `{suite: {number of the task in it: environment}}`.
+
+        Finished episodes freeze instead of being simulated further. The workers of the first task are forked here,
+        which in `lerobot-eval` is before the policy exists, those of the others when their turn comes.
+        """
+        makers = {
+            suite: [[functools.partial(CalvinEnv, task=task, **self.gym_kwargs)] * n_envs for task in tasks]
+            for suite, tasks in self._suites().items()
+        }
         if not use_async_envs or n_envs == 1:
-            return {task: {0: gym.vector.SyncVectorEnv(**_freezing(made))} for task, made in makers.items()}
-        if self.renderer.startswith("fast"):  # reads compiled kernels and meshes once, before the fork
+            return {suite: dict(enumerate(map(SerialVectorEnv, made))) for suite, made in makers.items()}
+        if self.renderer in OURS:  # reads compiled kernels and meshes once, before the fork
             with Desk(self.scene, self.assets, cameras=(), renderer=self.renderer) as desk:
                 desk.render()
-        envs = {task: ForkedVectorEnv(made) for task, made in makers.items()}
-        envs[tasks[0]]._ensure()
-        return {task: {0: env} for task, env in envs.items()}  # type: ignore[dict-item]
+        envs = {suite: [ForkedVectorEnv(each) for each in made] for suite, made in makers.items()}
+        next(iter(envs.values()))[0]._ensure()
+        return {suite: dict(enumerate(made)) for suite, made in envs.items()}
 
-
-class ForkedVectorEnv(_LazyAsyncVectorEnv):
-    """LeRobot's asynchronous environments, started at first use, in forked workers; finished episodes freeze."""
-
-    _env: gym.vector.AsyncVectorEnv | None
-
-    def _ensure(self) -> None:
-        if self._env is None:
-            self._env = gym.vector.AsyncVectorEnv(**_freezing(self._env_fns), context="fork")
-
-
-def _freezing(makers: Sequence[Callable[[], gym.Env]]) -> dict[str, Any]:
-    """Arguments of a vector environment whose finished episodes freeze."""
-    return {
-        "env_fns": [freeze_after_episode_end(make) for make in makers],
-        "autoreset_mode": gym.vector.AutoresetMode.NEXT_STEP,
-    }
+    def _suites(self) -> dict[str, tuple[str, ...]]:
+        return suites(self.task or LH_MTLC)

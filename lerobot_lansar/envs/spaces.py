@@ -5,15 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium import spaces
 
-from ..calvin import ACTION_NAMES, CAMERAS, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
+from ..calvin import ACTION_NAMES, CAMERAS, HOME_EULER, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
 from ..desk import DeskError
 
 ACTION_SIZE = len(ACTION_NAMES["rel"])
 
 # Absolute actions: x, y, z (m), roll, pitch, yaw (rad), gripper. The desk accepts angles with any number of full turns;
-# the roll's range is that of a hand that points down.
-_ABSOLUTE_LOW = (-1.0, -1.0, 0.2, np.pi / 2, -np.pi, -np.pi, -1.0)
-_ABSOLUTE_HIGH = (1.0, 1.0, 1.0, np.pi * 3 / 2, np.pi, np.pi, 1.0)
+# these are within half a turn of the hand at rest, as in the observation, the roll within a quarter.
+_TURNS = np.array([np.pi / 2, np.pi, np.pi])
+_ABSOLUTE_LOW = (-1.0, -1.0, 0.2, *(HOME_EULER - _TURNS), -1.0)
+_ABSOLUTE_HIGH = (1.0, 1.0, 1.0, *(HOME_EULER + _TURNS), 1.0)
 
 
 def environment_state_size(task_in_state: bool) -> int:

@@ -1,6 +1,7 @@
 """The gymnasium environment: chains, single tasks, rewards, ends of episodes, vector environments."""
 
 import json
+import re
 
 import gymnasium
 import numpy as np
@@ -10,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 import lerobot_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.benchmark import EPISODES_FILE, load_chains
-from lerobot_lansar.calvin import TASKS
+from lerobot_lansar.calvin import TASKS, continuous_euler
 from lerobot_lansar.demos.motion import Motion
 from lerobot_lansar.demos.moves import View
 from lerobot_lansar.demos.skills import SKILLS
@@ -96,6 +97,8 @@ def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_pat
     assert episode["successes"] == 2
     assert [c["success"] for c in episode["commands"]] == [True, True, False]
     assert episode["commands"][2]["steps"] == 200
+    assert episode["reason"] is None
+    assert episode["sentence"] == "first"
     env.close()
 
 
@@ -138,14 +141,51 @@ def test_actions_of_the_other_control_mode_are_refused_at_once():
     env.close()
 
 
-def test_a_diverged_episode_fails_and_the_next_one_is_unaffected():
-    env = CalvinEnv("turn_on_led", cameras=())
+def test_a_badly_trained_policys_relative_action_is_not_taken_for_an_absolute_one():
+    env = CalvinEnv("open_drawer", cameras=())
+    env.reset(seed=0)
+    env.step([4.0, -7.0, 0.5, 2.5, 0, 0.4, 1])
+    env.close()
+
+
+@pytest.mark.parametrize(("value", "reason"), [(np.nan, "must be finite"), (1000.0, r"within \+-100")])
+@pytest.mark.parametrize("mode", ["rel", "abs"])
+def test_a_wild_action_fails_its_episode_and_says_why(tmp_path, mode, value, reason):
+    env = CalvinEnv("turn_on_led", cameras=(), control_mode=mode, results_dir=str(tmp_path))
+    first, _ = env.reset(seed=3)
+    stay = NOTHING if mode == "rel" else np.r_[first["agent_pos"][:6], 1]
+    before = env.step(stay)[0]
+    with pytest.warns(UserWarning, match="episodes fail early"):
+        obs, reward, terminated, truncated, info = env.step(np.r_[value, stay[1:]])
+    assert (reward, terminated, truncated, info["is_success"]) == (0, True, False, False)
+    np.testing.assert_array_equal(obs["agent_pos"], before["agent_pos"])
+    np.testing.assert_array_equal(env.reset(seed=3)[0]["environment_state"], first["environment_state"])
+    env.close()
+    (line,) = map(json.loads, (tmp_path / EPISODES_FILE).read_text().splitlines())
+    assert re.search(reason, line["reason"])
+    assert line["commands"] == [
+        {"task": "turn_on_led", "sentence": env._sentences["turn_on_led"][0], "success": False, "steps": 2}
+    ]
+
+
+def test_an_action_of_another_size_stops_the_run():
+    env = CalvinEnv("open_drawer", cameras=())
+    env.reset(seed=0)
+    with pytest.raises(DeskError, match=r"shape \(7,\), got \(6,\)"):
+        env.step(np.zeros(6))
+    env.close()
+
+
+def test_a_diverged_episode_fails_and_the_next_one_is_unaffected(tmp_path):
+    env = CalvinEnv("turn_on_led", cameras=(), results_dir=str(tmp_path))
     first, _ = env.reset(seed=3)
     env.render()
     red = env._desk._blocks["red"].body
     pybullet.resetBaseVelocity(red, [np.inf, 0, 0], physicsClientId=env._desk._client)
-    obs, reward, terminated, _, info = env.step(np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    with pytest.warns(UserWarning, match="its simulation diverges"):
+        obs, reward, terminated, _, info = env.step(NOTHING)
     assert terminated
+    assert json.loads((tmp_path / EPISODES_FILE).read_text())["reason"] == "simulation diverged"
     assert reward == 0
     assert not info["is_success"]
     assert np.isfinite(obs["environment_state"]).all()
@@ -205,6 +245,63 @@ def test_perturbations_depend_on_the_seed_alone():
     assert draws[0] == draws[1] != draws[2]
 
 
+def test_agent_pos_has_angles_that_do_not_jump_and_everything_else_as_calvin():
+    env = CalvinEnv("open_drawer", cameras=(), control_mode="abs")
+    obs, _ = env.reset(seed=0)
+    raw = []
+    for roll in np.pi + np.array([-0.2, 0.2, 0.2, -0.2, -0.2, 0.2]):
+        for _ in range(6):
+            obs = env.step([*obs["agent_pos"][:3], roll, *obs["agent_pos"][4:6], 1])[0]
+            state = env._desk.observe()["robot_obs"]
+            np.testing.assert_array_equal(np.delete(obs["agent_pos"], [3, 4, 5]), np.delete(state, [3, 4, 5]))
+            np.testing.assert_array_equal(obs["agent_pos"][3:6], continuous_euler(state[3:6]))
+            assert abs(obs["agent_pos"][3] - np.pi) < 0.5
+            raw.append(state[3])
+    assert min(raw) < -3
+    assert max(raw) > 3
+    env.close()
+
+
+def test_absolute_actions_may_have_any_turn():
+    states = []
+    for turns in (0, -1, 2):
+        env = CalvinEnv("open_drawer", cameras=(), control_mode="abs")
+        obs, _ = env.reset(seed=0)
+        target = obs["agent_pos"][:6] + [0.03, 0.02, 0, 0.1, 0, 0]
+        for _ in range(8):
+            obs = env.step([*target[:3], *(target[3:] + 2 * np.pi * turns), 1])[0]
+        states.append(obs["agent_pos"])
+        env.close()
+    np.testing.assert_allclose(states[1:], [states[0]] * 2, atol=1e-9)
+
+
+def test_random_sentences_depend_on_the_seed_alone_and_are_all_used(tmp_path):
+    env = CalvinEnv(cameras=(), sentence="random")
+    spoken: dict[str, set[str]] = {}
+    for seed in (*range(0, 40, 4), 8):
+        env.reset(seed=seed)
+        first = env._current
+        spoken.setdefault(first, set()).add(env.task_description)
+        before = env.task_description
+        env.reset(seed=seed)
+        assert env.task_description == before
+        assert before in env._sentences[first]
+    assert any(env._sentences[task][0] not in sentences for task, sentences in spoken.items())
+    single = CalvinEnv("open_drawer", cameras=(), sentence="random")
+    single._desk = env._desk  # opening one takes longer than this test
+    found = {(single.reset(seed=seed), single.task_description)[1] for seed in range(12)}
+    assert found == set(env._sentences["open_drawer"])
+    env.close()
+
+
+def test_a_sentence_is_drawn_without_changing_the_start():
+    env = CalvinEnv("open_drawer", cameras=())
+    first, _ = env.reset(seed=2)
+    env.sentence = "random"
+    np.testing.assert_array_equal(env.reset(seed=2)[0]["environment_state"], first["environment_state"])
+    env.close()
+
+
 def test_pictures_are_drawn_at_render_fps():
     env = CalvinEnv("open_drawer", cameras=(), render_fps=10)
     env.reset(seed=0)
@@ -224,6 +321,8 @@ def test_options_are_checked_by_name(tmp_path):
         CalvinEnv(scene="A")
     with pytest.raises(DeskError, match="'joint' is unknown"):
         CalvinEnv(control_mode="joint")
+    with pytest.raises(DeskError, match="'last' is unknown"):
+        CalvinEnv(sentence="last")
     with pytest.raises(DeskError, match="give both or neither"):
         CalvinEnv(perturbation_every=5)
     with pytest.raises(DeskError, match="does not exist"):

@@ -3,22 +3,28 @@
 import inspect
 import io
 import json
+import sys
 from contextlib import redirect_stdout
 from dataclasses import fields
 
 import draccus
 import numpy as np
 import pytest
+import torch
 from draccus.wrappers.docstring import get_attribute_docstring
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.processor import RelativeActionsProcessorStep
 
 import lerobot_policy_lansar  # noqa: F401  (registers the environment)
-from lerobot_lansar.desk import DeskError
+from lerobot_lansar.calvin import ACTION_NAMES, TASK_GROUPS, TASKS, continuous_euler
+from lerobot_lansar.desk import Desk, DeskError
 from lerobot_lansar.desk.sentences import COMMANDS
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
+from lerobot_lansar.envs.suites import suites
 
 
 def test_is_registered_under_its_name():
@@ -44,7 +50,7 @@ def test_every_option_of_the_desk_is_explained_by_help():
     own = {field.name for field in fields(CalvinEnvConfig)} - inherited | {"task", "fps"}
     explained = {name for name in own if get_attribute_docstring(CalvinEnvConfig, name).comment_above}
     assert explained == own
-    assert len(own) == 14
+    assert len(own) == 15
     text = io.StringIO()
     with pytest.raises(SystemExit), redirect_stdout(text):
         draccus.parse(CalvinEnvConfig, args=["--help"])
@@ -56,6 +62,111 @@ def test_every_argument_of_the_environment_is_an_option():
     arguments = set(inspect.signature(CalvinEnv).parameters) - {"task", "render_mode"}
     assert set(options.gym_kwargs) == arguments
     assert {options.gym_kwargs[name] for name in ("steps_per_command", "render_fps")} == {7, 5}
+
+
+def test_every_task_is_in_one_group():
+    named = [task for tasks in TASK_GROUPS.values() for task in tasks]
+    assert sorted(named) == sorted(TASKS)
+    assert not set(TASK_GROUPS) & set(TASKS)
+    assert TASK_GROUPS["stack"] == ("stack_block", "unstack_block")
+    assert [len(TASK_GROUPS[group]) for group in ("rotate", "push", "lift", "lights")] == [6, 7, 9, 4]
+
+
+def test_groups_are_suites_of_their_tasks():
+    assert suites("all") == TASK_GROUPS
+    assert list(suites("lh_mtlc, drawer,turn_on_led").items()) == [
+        ("lh_mtlc", ("lh_mtlc",)),
+        ("drawer", ("open_drawer", "close_drawer")),
+        ("turn_on_led", ("turn_on_led",)),
+    ]
+    envs = make_env(CalvinEnvConfig(task="drawer", cameras=[]), n_envs=1)
+    assert list(envs) == ["drawer"]
+    assert {number: env.call("task") for number, env in envs["drawer"].items()} == {
+        0: ("open_drawer",),
+        1: ("close_drawer",),
+    }
+    with pytest.raises(DeskError, match=r"--env\.task: 'juggle' is unknown.* a group \(rotate, push"):
+        CalvinEnvConfig(task="lift,juggle")
+    with pytest.raises(DeskError, match="names open_drawer twice"):
+        CalvinEnvConfig(task="open_drawer,all")
+
+
+def test_another_frame_rate_is_refused_with_the_reason():
+    with pytest.raises(DeskError, match=r"--env\.fps must be 30, got 10: .* --env\.render_fps"):
+        CalvinEnvConfig(fps=10)
+
+
+def act(folder, size):
+    """A checkpoint's configuration, of an ACT that was trained on so many numbers of environment state."""
+    features = {"observation.environment_state": {"type": "ENV", "shape": [size]}} if size else {}
+    file = folder / "config.json"
+    ACTConfig(device="cpu")._save_pretrained(folder)
+    file.write_text(json.dumps({**json.loads(file.read_text()), "input_features": features}))
+    return f"--policy.path={folder}"
+
+
+@pytest.mark.parametrize(("trained", "told"), [(58, "true"), (24, "false")])
+def test_a_forgotten_task_in_state_is_named_before_the_first_step(tmp_path, monkeypatch, trained, told):
+    wrong = CalvinEnvConfig(task_in_state=told == "false")
+    right = CalvinEnvConfig(task_in_state=told == "true")
+    dataset = tmp_path / "dataset" / "meta" / "info.json"
+    dataset.parent.mkdir(parents=True)
+    dataset.write_text(json.dumps({"features": {"observation.environment_state": {"shape": [trained]}}}))
+    trains = ["--policy.type=act", "--dataset.repo_id=you/desk", f"--dataset.root={tmp_path / 'dataset'}"]
+    for arguments in ([act(tmp_path, trained)], trains):
+        monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments])
+        right.get_env_processors()
+        with pytest.raises(DeskError, match=f"trained on {trained} numbers .*set --env.task_in_state={told}"):
+            wrong.get_env_processors()
+
+
+def test_a_policy_that_reads_no_environment_state_may_have_any(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", act(tmp_path, None)])
+    for told in (True, False):
+        CalvinEnvConfig(task_in_state=told).get_env_processors()
+
+
+def test_recording_is_refused_where_lerobot_would_mix_up_sentences(monkeypatch):
+    for recording in ("true", "false"):
+        monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--eval.recording={recording}"])
+        CalvinEnvConfig(task="lift").get_env_processors()
+        for options in ({}, {"task": "lift", "sentence": "random"}):
+            if recording == "false":
+                CalvinEnvConfig(**options).get_env_processors()
+            else:
+                with pytest.raises(DeskError, match="label every frame with one sentence"):
+                    CalvinEnvConfig(**options).get_env_processors()
+
+
+def test_lerobots_relative_actions_do_not_jump_where_a_roll_passes_half_a_turn():
+    relative = RelativeActionsProcessorStep(enabled=True, exclude_joints=["gripper"], action_names=ACTION_NAMES["abs"])
+    envs = make_env(CalvinEnvConfig(task="open_drawer", cameras=[], control_mode="abs"), n_envs=1)
+    env = envs["open_drawer"][0]
+    obs, _ = env.reset(seed=[0])
+    differences, rolls = [], []
+    with Desk(cameras=()) as desk:  # stands for the recording: its angles are CALVIN's
+        recorded = desk.reset()["robot_obs"]
+        for swing in np.sin(np.linspace(0, 4 * np.pi, 60)):
+            goal = np.array([*recorded[:3], np.pi + 0.3 * swing, *recorded[4:6], 1.0])
+            goal[3] = (goal[3] + np.pi) % (2 * np.pi) - np.pi  # as CALVIN writes it
+            action = np.r_[goal[:3], continuous_euler(goal[3:6]), 1.0]  # as datasets have it
+            for state in (preprocess_observation(obs)["observation.state"], dataset_state(recorded)):
+                transition = {"observation": {"observation.state": state}, "action": torch.tensor(action[None])}
+                differences.append(relative(transition)["action"][0, 3:6].numpy())
+            rolls.append(recorded[3])
+            recorded = desk.step(goal, "abs")["robot_obs"]
+            obs = env.step(np.r_[obs["agent_pos"][0, :3], action[3:]][None])[0]
+    env.close()
+    assert min(rolls) < -3
+    assert max(rolls) > 3
+    assert np.abs(np.diff(rolls)).max() > 6, "the recording does jump"
+    assert np.abs(differences[20:]).max() < 0.5, "after both arms have reached the first pose"
+
+
+def dataset_state(robot_obs):
+    """A recorded state as `observation.state` of a dataset, in a batch of one."""
+    state = np.r_[robot_obs[:3], continuous_euler(robot_obs[3:6]), robot_obs[6:]]
+    return torch.tensor(state[None], dtype=torch.float32)
 
 
 def test_parallel_tasks_are_refused_because_they_share_a_policy():
@@ -84,6 +195,19 @@ def rollout(use_async: bool, results_dir):
     for tasks in envs.values():
         tasks[0].close()
     return np.array(states), np.array(ends), prepared
+
+
+def test_wild_actions_of_one_episode_leave_the_others_of_its_batch_alone():
+    (env,) = make_env(CalvinEnvConfig(task="turn_on_led", cameras=[]), n_envs=2, use_async_envs=True)[
+        "turn_on_led"
+    ].values()
+    env.reset(seed=[3, 4])
+    action = np.tile([0.5, 0, 0, 0, 0, 0, 1], (2, 1))
+    action[0, 2] = np.nan
+    ends = [env.step(action)[2].tolist() for _ in range(3)]
+    assert ends[0] == [True, False]
+    assert not any(end[1] for end in ends)
+    env.close()
 
 
 def test_sync_and_async_agree_and_finished_episodes_freeze(tmp_path):
