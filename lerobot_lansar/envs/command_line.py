@@ -10,18 +10,20 @@ from pathlib import Path
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE
 
-from ..desk import DeskError
+from ..command import CommandError
 from .spaces import environment_state_size
 
 
 def refuse_recording() -> None:
     """Refuses `--eval.recording=true` where sentences differ between episodes or change within one.
 
+    LeRobot would label all frames with the first environment's first sentence.
+
     Raises:
-        DeskError: The command records. LeRobot would write the first sentence of the first environment for all frames.
+        CommandError: The command records.
     """
     if (parser.parse_arg("eval.recording") or "false").lower() != "false":
-        raise DeskError(
+        raise CommandError(
             "--eval.recording=true would label every frame with one sentence, the first environment's first, but "
             "chains and --env.sentence=random have several: record single tasks with --env.sentence=first, or use "
             "lansar-record for demonstrations"
@@ -37,11 +39,11 @@ def check_environment_state(task_in_state: bool) -> None:
         task_in_state: The environment's option.
 
     Raises:
-        DeskError: They differ by the task's 34 numbers.
+        CommandError: They differ by the task's 34 numbers.
     """
     size, trained = environment_state_size(task_in_state), _trained_size()
     if trained == environment_state_size(not task_in_state):
-        raise DeskError(
+        raise CommandError(
             f"the policy was trained on {trained} numbers of {OBS_ENV_STATE}, but the environment gives {size}: "
             f"set --env.task_in_state={str(not task_in_state).lower()}"
         )

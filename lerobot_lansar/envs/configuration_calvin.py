@@ -11,7 +11,8 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from ..benchmark import LH_MTLC
 from ..calvin import CAMERAS, CONTROL_HZ, ROBOT_OBS_NAMES, STEPS_PER_COMMAND
-from ..desk import Desk, DeskError
+from ..command import CommandError
+from ..desk import Desk
 from ..desk.render import OURS
 from .calvin import CalvinEnv
 from .command_line import check_environment_state, refuse_recording
@@ -23,7 +24,12 @@ from .vector import ForkedVectorEnv, SerialVectorEnv
 @EnvConfig.register_subclass("calvin")
 @dataclass
 class CalvinEnvConfig(EnvConfig):
-    """The CALVIN desk. The comment above each option is its help text; `CalvinEnv` documents the environment."""
+    """The CALVIN desk. The comment above each option is its help text; `CalvinEnv` documents the environment.
+
+    Raises:
+        CommandError: An option cannot be used. LeRobot's commands end with its message; that of a ValueError would
+            stand above a long traceback.
+    """
 
     # lh_mtlc for the benchmark's chains, a task's name, a group (rotate, push, slider, drawer, lift, place, stack,
     # lights), all for the 34 tasks, or several of these separated by commas. LeRobot evaluates one task after the
@@ -61,12 +67,12 @@ class CalvinEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         if self.max_parallel_tasks != 1:
-            raise DeskError(
+            raise CommandError(
                 "--env.max_parallel_tasks must be 1: LeRobot's parallel tasks share one policy object, which would "
                 "mix the episodes' histories"
             )
         if self.fps != CONTROL_HZ:
-            raise DeskError(
+            raise CommandError(
                 f"--env.fps must be {CONTROL_HZ}, got {self.fps}: the desk makes {CONTROL_HZ} control steps per "
                 "second, as CALVIN does. --env.render_fps sets how many pictures per second the videos have"
             )
@@ -79,7 +85,7 @@ class CalvinEnvConfig(EnvConfig):
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
         for camera in self.cameras:
             if camera not in CAMERAS:
-                raise DeskError(f"--env.cameras: {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+                raise CommandError(f"--env.cameras: {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
             size, key = CAMERAS[camera], f"{OBS_IMAGES}.{camera}"
             self.features[key] = PolicyFeature(FeatureType.VISUAL, (size, size, 3))
             self.features_map[key] = key
@@ -113,7 +119,7 @@ class CalvinEnvConfig(EnvConfig):
         """Processors that change nothing. LeRobot asks for them before the first step, in training too.
 
         Raises:
-            DeskError: The command's policy was trained with another `environment_state`: `--env.task_in_state` was
+            CommandError: The command's policy was trained with another `environment_state`: `--env.task_in_state` was
                 forgotten, or is too much. Or the command records episodes whose sentences LeRobot would mix up.
         """
         if self.sentence == "random" or LH_MTLC in self._suites():

@@ -20,7 +20,8 @@ from lerobot.processor import RelativeActionsProcessorStep
 
 import lerobot_policy_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.calvin import ACTION_NAMES, TASK_GROUPS, TASKS, continuous_euler
-from lerobot_lansar.desk import Desk, DeskError
+from lerobot_lansar.command import CommandError
+from lerobot_lansar.desk import Desk
 from lerobot_lansar.desk.sentences import COMMANDS
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
@@ -41,7 +42,7 @@ def test_features_follow_the_cameras():
     }
     told = env_to_policy_features(CalvinEnvConfig(task_in_state=True))
     assert told["observation.environment_state"].shape == (58,)
-    with pytest.raises(DeskError, match=r"--env\.cameras: 'wrist'"):
+    with pytest.raises(CommandError, match=r"--env\.cameras: 'wrist'"):
         CalvinEnvConfig(cameras=["wrist"])
 
 
@@ -85,15 +86,15 @@ def test_groups_are_suites_of_their_tasks():
         0: ("open_drawer",),
         1: ("close_drawer",),
     }
-    with pytest.raises(DeskError, match=r"--env\.task: 'juggle' is unknown.* a group \(rotate, push"):
+    with pytest.raises(CommandError, match=r"--env\.task: 'juggle' is unknown.* a group \(rotate, push"):
         CalvinEnvConfig(task="lift,juggle")
-    with pytest.raises(DeskError, match="names open_drawer twice"):
+    with pytest.raises(CommandError, match="names open_drawer twice"):
         CalvinEnvConfig(task="open_drawer,all")
 
 
 def test_another_frame_rate_is_refused_with_the_reason():
-    with pytest.raises(DeskError, match=r"--env\.fps must be 30, got 10: .* --env\.render_fps"):
-        CalvinEnvConfig(fps=10)
+    with pytest.raises(CommandError, match=r"--env\.fps must be 30, got 10: .* --env\.render_fps"):
+        draccus.parse(CalvinEnvConfig, args=["--fps=10"])
 
 
 def act(folder, size):
@@ -116,7 +117,7 @@ def test_a_forgotten_task_in_state_is_named_before_the_first_step(tmp_path, monk
     for arguments in ([act(tmp_path, trained)], trains):
         monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments])
         right.get_env_processors()
-        with pytest.raises(DeskError, match=f"trained on {trained} numbers .*set --env.task_in_state={told}"):
+        with pytest.raises(CommandError, match=f"trained on {trained} numbers .*set --env.task_in_state={told}"):
             wrong.get_env_processors()
 
 
@@ -134,7 +135,7 @@ def test_recording_is_refused_where_lerobot_would_mix_up_sentences(monkeypatch):
             if recording == "false":
                 CalvinEnvConfig(**options).get_env_processors()
             else:
-                with pytest.raises(DeskError, match="label every frame with one sentence"):
+                with pytest.raises(CommandError, match="label every frame with one sentence"):
                     CalvinEnvConfig(**options).get_env_processors()
 
 
@@ -170,7 +171,7 @@ def dataset_state(robot_obs):
 
 
 def test_parallel_tasks_are_refused_because_they_share_a_policy():
-    with pytest.raises(DeskError, match="max_parallel_tasks must be 1"):
+    with pytest.raises(CommandError, match="max_parallel_tasks must be 1"):
         CalvinEnvConfig(max_parallel_tasks=2)
 
 
