@@ -8,7 +8,7 @@ for candidate in \
     "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.12*/bin/python3 \
     "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.13*/bin/python3 \
     "$HOME"/.local/share/uv/python/cpython-3.1[23]*/bin/python3 \
-    /opt/homebrew/bin/python3.12 /usr/local/bin/python3.12; do
+    /opt/homebrew/bin/python3.1[23] /usr/local/bin/python3.1[23]; do
     if works "$candidate"; then
         "$candidate" -c 'import sys; print(sys.executable)'
         exit 0
