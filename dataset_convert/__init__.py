@@ -1,1 +1,27 @@
-"""CALVIN demonstrations as LeRobotDatasets: `lansar-convert` or `python -m dataset_convert`."""
+"""CALVIN demonstrations as LeRobotDatasets: `lansar-convert` or `python -m dataset_convert`.
+
+Converting, in the order in which data flow:
+
+convert         lansar-convert: from a CALVIN folder to a dataset in its place
+options         its options
+calvin          reads a split: language index, scenes, frames
+safe_pickle     reads .npy files from strangers, pickled ones too
+episodes        which frames become an episode
+plan            the episodes in shards, and everything that a worker must know of them
+checks          what must hold of the source: finite numbers, consistent actions, known block columns
+shards          converts one shard: find the bad episodes, write the others, note
+writer          writes a shard's frame table and videos
+layout          how the files lie on disk: features of cameras, paths, the manifest's name
+stats           statistics of an episode, as LeRobot keeps them
+features        what LeRobot is told of the dataset; the only one of these that imports LeRobot
+finish          all shards become one dataset
+card            its README.md
+hub             uploads it, and finds downloads
+
+On a finished dataset:
+
+embed           lansar-embed: CLIP embeddings beside it
+verify          lansar-verify: compares it with its source
+verify_claims   what the dataset says of itself
+verify_frames   its frames
+"""

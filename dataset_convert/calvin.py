@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from dataset_convert.safe_pickle import load_object_array, parse_npy, read_index
+from dataset_convert.safe_pickle import load_object_array, parse_npy, read_index_file
 from lerobot_lansar.calvin import CAMERAS
 
 VECTORS = {"robot_obs": (15,), "scene_obs": (24,), "actions": (7,), "rel_actions": (7,)}
@@ -39,11 +39,11 @@ TACTILE = {"rgb_tactile": (160, 120, 6), "depth_tactile": (160, 120, 2)}
 
 _SHAPES = VECTORS | RGB | DEPTH | TACTILE
 
-_MOST_BYTES = 1 << 20
-"""No array of a frame is half as large."""
+_MAX_BYTES = 1 << 20
+"""Limit for one array; the largest of a frame takes less than half of it."""
 
-_BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Ways to pack an array of which zipfile unpacks no more than it is asked for; numpy uses no others."""
+_SAFE_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods of which zipfile unpacks no more than it is asked for; numpy uses no others."""
 
 _REPAIR = "download or record it again"
 _NO_PICTURES = "recorded without cameras? then use --images=none and no --embed"
@@ -56,7 +56,7 @@ class Window:
 
     Attributes:
         start: First frame number.
-        end: First frame number after the window (exclusive, a CALVIN fact that is easy to get wrong).
+        end: First frame number after the window: exclusive in CALVIN, which is easy to get wrong.
         task: Task name, such as `open_drawer`.
         sentence: The command in words.
         scene: The scene's letter, such as `D`.
@@ -79,7 +79,7 @@ class CalvinSplit:
         root: The dataset's folder.
         name: The split's name.
         folder: The split's folder.
-        scenes: Scene letter -> (first, last) frame, both inclusive.
+        scenes: Scene letter to its (first, last) frame, both inclusive.
         windows: The annotated windows in the file's order.
         recordings: (N, 2) first and last frame of each uninterrupted recording, in order.
         source_sha256: Hash of the index files, which identifies what was converted.
@@ -122,15 +122,15 @@ class CalvinSplit:
         """Reads some arrays of some frames.
 
         Args:
-            frames: N frame numbers.
+            frames: n frame numbers.
             keys: Names out of `VECTORS`, `RGB`, `DEPTH` and `TACTILE`.
 
         Returns:
-            For each key an array of shape (n, …) in the file's floating dtype, or uint8 for colours.
+            For each key an array of shape (n, ...) in the file's floating dtype, or uint8 for colours.
 
         Raises:
             FileNotFoundError: A frame's file is missing.
-            OSError: The machine cannot read a file, about which this says nothing.
+            OSError: The machine cannot read a file, which need not be defective.
             ValueError: A file is truncated, or an array in it is missing or has a wrong shape or dtype; the
                 message names the file and the key.
         """
@@ -140,6 +140,21 @@ class CalvinSplit:
             for key, array in _load(path, columns).items():
                 columns[key].append(_checked(array, key, path))
         return {key: np.stack(column) for key, column in columns.items()}
+
+
+def digest(arrays: dict[str, np.ndarray], so_far: Any = None) -> Any:
+    """SHA-256 of some frames' arrays, continued from the frames before.
+
+    Args:
+        arrays: What `CalvinSplit.read` returned.
+        so_far: What this returned for the frames before.
+    """
+    so_far = so_far or hashlib.sha256()
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        so_far.update(f"{key} {array.dtype.str} {array.shape}".encode())
+        so_far.update(array)
+    return so_far
 
 
 def frame_numbers(folder: Path) -> np.ndarray:
@@ -159,10 +174,10 @@ def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{path} is missing: the split is incomplete, {_REPAIR}") from error
     except MemoryError:
-        raise  # the machine's fault: what is read is small, whatever the file says
+        raise  # the machine's fault: no more than _MAX_BYTES are read, whatever the file says
     except Exception as error:  # damaged bytes make zipfile and numpy raise nearly anything
-        fault = error.__context__ if isinstance(error, zipfile.BadZipFile) else error  # zipfile hides some
-        if isinstance(fault, OSError) and fault.errno != errno.EINVAL:  # EINVAL comes of a damaged offset
+        fault = error.__context__ if isinstance(error, zipfile.BadZipFile) else error  # zipfile hides some OSErrors
+        if isinstance(fault, OSError) and fault.errno != errno.EINVAL:  # a damaged offset gives EINVAL
             raise OSError(fault.errno, fault.strerror, str(path)) from error
         raise ValueError(f"{path}: truncated or not an npz file ({error!r}); {_REPAIR}") from error
     remedy = _NO_PICTURES if missing[0] in RGB else _REPAIR if missing[0] in VECTORS else _NO_EXTRA
@@ -170,20 +185,20 @@ def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 def _read_member(stored: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Reads no more than an array takes, whatever the file says and whatever would come out of it."""
-    if member.file_size > _MOST_BYTES:
+    """Reads no more than an array takes, even if the file claims or would unpack to more."""
+    if member.file_size > _MAX_BYTES:
         raise ValueError(f"{member.filename} has {member.file_size} bytes, more than any array of a frame")
-    if member.compress_type not in _BOUNDED:
-        raise ValueError(f"{member.filename} is packed by method {member.compress_type}, not as numpy does")
+    if member.compress_type not in _SAFE_COMPRESSION:
+        raise ValueError(f"{member.filename} is compressed by method {member.compress_type}, which numpy does not use")
     with stored.open(member) as file:
         return file.read(member.file_size)
 
 
 def _checked(array: np.ndarray, key: str, path: Path) -> np.ndarray:
-    shape, is_colour = _SHAPES[key], key.startswith("rgb_")
-    is_right_kind = array.dtype == np.uint8 if is_colour else array.dtype.kind == "f"
+    shape, is_color = _SHAPES[key], key.startswith("rgb_")
+    is_right_kind = array.dtype == np.uint8 if is_color else array.dtype.kind == "f"
     if array.shape != shape or not is_right_kind:
-        wanted = f"{'uint8' if is_colour else 'float'} {shape}"
+        wanted = f"{'uint8' if is_color else 'float'} {shape}"
         raise ValueError(f"{path}: array {key!r} is {array.dtype} {array.shape}, expected {wanted}")
     return array
 
@@ -198,12 +213,12 @@ def _read_scenes(path: Path) -> dict[str, tuple[int, int]]:
         wanted = "{scene name: [first frame, last frame]}"
         raise ValueError(f"{path}: expected {wanted}, found {reprlib.repr(stored)}") from error
     if not scenes:
-        raise ValueError(f"{path}: names no scene")
+        raise ValueError(f"{path} names no scene")
     return scenes
 
 
 def _read_recordings(path: Path) -> np.ndarray:
-    content = read_index(path)
+    content = read_index_file(path)
     try:
         recordings = parse_npy(content).reshape(-1, 2)
         if recordings.dtype.kind not in "iu":

@@ -1,4 +1,4 @@
-"""The dataset's card (README.md), also used on the Hugging Face hub."""
+"""The dataset's card: its README.md, shown on the Hugging Face hub."""
 
 import json
 from collections import Counter
@@ -21,8 +21,8 @@ _MEANING = {
     "calvin.rel_actions": f"the same action in relative form: {_REL}",
     "calvin.frame": "frame number in the source",
     "calvin.window": "annotated window that the frame belongs to (its place in the language file), −1 for none",
-    "calvin.task": "CALVIN task, a place in `task_names` of `meta/calvin_source.json`, −1 for none",
-    "calvin.scene": "scene, a place in `scene_names` of `meta/calvin_source.json`",
+    "calvin.task": f"CALVIN task, a place in `task_names` of `{MANIFEST}`, −1 for none",
+    "calvin.scene": f"scene, a place in `scene_names` of `{MANIFEST}`",
     "observation.images.static": "fixed camera",
     "observation.images.gripper": "camera in the hand",
     "observation.images.static_depth": "distances (m) of the fixed camera",
@@ -32,6 +32,7 @@ _MEANING = {
 
 def write(root: Path, repo_id: str) -> None:
     """Writes README.md."""
+    # Takes seconds, and worker processes import this module.
     from lerobot.datasets.io_utils import load_info
     from lerobot.datasets.utils import create_lerobot_dataset_card
 
@@ -43,7 +44,7 @@ def write(root: Path, repo_id: str) -> None:
 
 
 def fields(root: Path, repo_id: str) -> dict[str, Any]:
-    """What LeRobot's card is told of a converted dataset."""
+    """The variables that LeRobot's template of a card takes, for a converted dataset."""
     manifest = json.loads((root / MANIFEST).read_text())
     info = json.loads((root / "meta" / "info.json").read_text())
     clip = root / "clip" / "clip.json"
@@ -62,7 +63,7 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
     """The description part of the card.
 
     Args:
-        manifest: What `meta/calvin_source.json` holds.
+        manifest: What the file `MANIFEST` holds.
         info: What `meta/info.json` holds.
         clip: What `clip/clip.json` holds, if there are embeddings.
         repo_id: The dataset's name.
@@ -94,7 +95,7 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
 * **Source:** split `{request["split"]}` of `{request["source"]}`, SHA-256 of its index files
   `{request["source_sha256"]}`, converted with lerobot_policy_lansar {manifest["versions"]["lerobot_policy_lansar"]}.
   Every frame was checked: finite, of the right shape and type, relative actions equal to what absolute actions and
-  states imply, no frame missing. `meta/calvin_source.json` has a SHA-256 of every episode's source frames and of every
+  states imply, no frame missing. `{MANIFEST}` has a SHA-256 of every episode's source frames and of every
   file in `data`, `videos` and `meta` but itself; `lansar-verify` compares this dataset with its source.
 * **Windows** end before their last number, as in CALVIN.{_windows(manifest, used)}
 * **Scenes:** {scenes}. Blocks are always red, blue, pink here.
@@ -142,7 +143,7 @@ def _windows(manifest: dict[str, Any], used: list[dict[str, Any]]) -> str:
 
 
 def _defects(manifest: dict[str, Any]) -> str:
-    return "\n".join(f"* {text}" for text in (_shared(manifest), _colours(manifest), _left_out(manifest)))
+    return "\n".join(f"* {text}" for text in (_shared(manifest), _colors(manifest), _left_out(manifest)))
 
 
 def _shared(manifest: dict[str, Any]) -> str:
@@ -156,7 +157,7 @@ def _shared(manifest: dict[str, Any]) -> str:
     return f"**Frames in both splits:** training and validation share {frames}; in episodes here: {here or 'none'}."
 
 
-def _colours(manifest: dict[str, Any]) -> str:
+def _colors(manifest: dict[str, Any]) -> str:
     """What the lifting windows say: the block that rises should be the one that the task names."""
     total, wrong, wrongs = 0, 0, []
     for letter, scene in manifest["scenes"].items():
@@ -180,7 +181,7 @@ def _left_out(manifest: dict[str, Any]) -> str:
         return "**Left out:** no defective episode."
     first = "; ".join(f"frames {e['start']}-{e['end'] - 1}: {e['reason']}" for e in bad[:5])
     return (
-        f"**Left out:** {len(bad)} defective episodes, all in `left_out` of `meta/calvin_source.json` "
+        f"**Left out:** {len(bad)} defective episodes, all in `left_out` of `{MANIFEST}` "
         f"({first}{'; …' if len(bad) > 5 else ''})."
     )
 
@@ -196,7 +197,7 @@ def _clip(clip: dict[str, Any] | None) -> str:
 
 
 def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
-    if request.get("task_in_state"):  # for policies that read no language; LanSAR refuses it
+    if request.get("task_in_state"):  # for policies that read no language; LanSAR refuses such a dataset
         cameras = " --env.cameras='[]'" if request["images"] == "none" else ""
         return f"""    lerobot-train --policy.type=act --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train

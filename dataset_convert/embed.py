@@ -1,7 +1,7 @@
 """`lansar-embed`: CLIP embeddings of a dataset's pictures, computed once and stored beside it.
 
-A pass of its own over a finished dataset; `lansar-convert --embed=true` runs the same one with pictures from the
-source, which were never compressed and serve a dataset without pictures too.
+It reads a finished dataset. `lansar-convert --embed=true` does the same with the source's pictures: they are not
+compressed, and exist even if the dataset has none.
 """
 
 import functools
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lerobot_lansar.clip.model import Clip
 
 ARRAYS = {feature: f"rgb_{camera}" for camera, feature in IMAGE_FEATURES.items()}
-"""LeRobot feature -> CALVIN array of the pictures that are embedded."""
+"""The pictures that are embedded: LeRobot's feature to CALVIN's array."""
 
 _SAVE_EVERY = 20  # batches
 
@@ -35,9 +35,9 @@ _SAVE_EVERY = 20  # batches
 class ClipOptions:
     """Which CLIP embeds the pictures."""
 
-    # open_clip's model name
+    # Name of the model in open_clip.
     model: str = "ViT-B-32"
-    # open_clip's tag of the weights, or a weights file; empty: untrained
+    # open_clip's tag of the weights, or a file of weights; empty: untrained.
     pretrained: str = "openai"
 
 
@@ -45,23 +45,24 @@ class ClipOptions:
 class EmbedConfig:
     """Stores CLIP embeddings of a LeRobotDataset's pictures in its folder `clip`."""
 
-    # name of the dataset, you/name
+    # Name of the dataset, you/name.
     repo_id: str
-    # its folder; by default where LeRobot looks for a dataset of that name, or its download from the hub
+    # Its folder; by default where LeRobot looks for a dataset of that name, or LeRobot's download from the hub.
     dataset_dir: Path | None = None
+    # Which CLIP embeds the pictures.
     clip: ClipOptions = field(default_factory=ClipOptions)
-    # pictures of each camera at a time
+    # Pictures of each camera at a time.
     batch_size: int = 128
-    # processes that decode pictures beside the one that embeds them
+    # Processes that decode pictures, beside the one that embeds them.
     num_workers: int = 0
 
 
 class Pictures(Protocol):
-    """Distinct pictures, and the rows of the dataset that show each: a torch dataset.
+    """Distinct pictures, and the rows of the dataset that show each one; a torch dataset.
 
     Attributes:
-        rows: (n,) arrays of row numbers, one per item.
-        name: Says where the pictures are from.
+        rows: For each item the numbers of the dataset's rows that show it, (n,).
+        name: Where the pictures are from.
     """
 
     rows: list[np.ndarray]
@@ -70,12 +71,12 @@ class Pictures(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, item: int) -> dict[str, Any]:
-        """Feature -> uint8 (H, W, 3), or float (3, H, W) in [0, 1]."""
+        """Feature to uint8 (H, W, 3), or float (3, H, W) in [0, 1]."""
         ...
 
 
 class SourcePictures:
-    """The pictures as they are in the CALVIN folder. Windows overlap there; every frame occurs once here.
+    """The pictures of the CALVIN folder; a frame that is in several windows occurs once.
 
     Args:
         split: Where they are.
@@ -110,6 +111,7 @@ class DatasetPictures:
     name = "dataset"
 
     def __init__(self, repo_id: str, root: Path):
+        # Takes seconds, and lansar-convert's worker processes import this module.
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
         self.dataset = LeRobotDataset(repo_id, root=root)
@@ -138,8 +140,9 @@ def load_clip(model: str, pretrained: str) -> "Clip":
         pretrained: open_clip's tag or a weights file; "" for an untrained model.
 
     Raises:
-        ValueError: There is no such model, or its weights cannot be had.
+        ValueError: There is no such model, or its weights cannot be loaded.
     """
+    # Take seconds, and lansar-convert's worker processes import this module.
     import torch
 
     from lerobot_lansar.clip.model import Clip, ClipConfig
@@ -147,7 +150,7 @@ def load_clip(model: str, pretrained: str) -> "Clip":
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         return Clip(ClipConfig(model=model, pretrained=pretrained), device)
-    except Exception as error:  # open_clip, the hub and torch have each their own for a name, a download, a file
+    except Exception as error:  # open_clip, the hub and torch each raise their own
         raise ValueError(f"--clip.model={model} --clip.pretrained={pretrained}: {error}") from error
 
 
@@ -162,21 +165,21 @@ def embed(
 ) -> None:
     """Writes `clip/<image feature>.npy`, (total_frames, D) float16 ordered by absolute index, and `clip/clip.json`.
 
-    `clip.json` says which CLIP it was, of which frames (`fingerprint`), and each array's SHA-256. The folder
-    appears complete; a pass that was interrupted, or killed at any time, goes on where it was last saved.
+    `clip.json` names the CLIP, the frames (`fingerprint`) and each array's SHA-256. The folder appears complete; a
+    pass that was interrupted, or killed at any time, goes on where it was last saved.
 
     Args:
         root: The dataset's folder.
         pictures: What to embed.
-        clip: Of `load_clip`.
-        options: Its name.
+        clip: What `load_clip` returned.
+        options: Names it.
         batch_size: Pictures of each camera at a time.
         num_workers: Processes that read pictures.
 
     Raises:
         ValueError: There are embeddings of another CLIP, or of other frames.
     """
-    from torch.utils.data import DataLoader, Subset
+    from torch.utils.data import DataLoader, Subset  # late, as in load_clip
 
     writer = EmbeddingWriter(
         root,

@@ -1,4 +1,4 @@
-"""What becomes an episode: annotated windows, or whole recordings in which windows are annotations."""
+"""Which frames become an episode: annotated windows, or whole recordings in which windows are annotations."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from dataset_convert.calvin import CalvinSplit, Window, frame_numbers
 MODES = ("windows", "play")
 DEDUP = ("none", "task", "frames")
 MAX_FRAMES = 54_000
-"""Half an hour. LeRobot keeps times as float32 and finds a video's frame to within 0.1 ms: later it could not."""
+"""Half an hour: beyond it LeRobot's float32 times no longer find a video's frame to within 0.1 ms."""
 
 NO_COMMAND = "play without a command"
-"""The task of a frame of play that no annotated window covers."""
+"""The sentence of a frame of play that no annotated window covers."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """The frames of one episode-to-be.
+    """The source frames of one episode.
 
     Attributes:
         start: First frame number of the source.
@@ -47,8 +47,8 @@ def window_spans(windows: list[Window], dedup: str, excluded: Iterable[int]) -> 
             a frame; "frames" as many as possible of which no two share a frame at all.
         excluded: Frames that no episode may contain.
     """
-    taboo = np.unique(np.fromiter(excluded, dtype=np.int64))
-    inside = [np.searchsorted(taboo, w.end) > np.searchsorted(taboo, w.start) for w in windows]
+    forbidden = np.unique(np.fromiter(excluded, dtype=np.int64))
+    inside = [np.searchsorted(forbidden, w.end) > np.searchsorted(forbidden, w.start) for w in windows]
     numbers = [number for number, is_excluded in enumerate(inside) if not is_excluded]
     if dedup != "none":
         numbers = _without_overlap(windows, numbers, lambda number: windows[number].task if dedup == "task" else None)
@@ -56,7 +56,7 @@ def window_spans(windows: list[Window], dedup: str, excluded: Iterable[int]) -> 
 
 
 def _without_overlap(windows: list[Window], numbers: list[int], group: Callable[[int], str | None]) -> list[int]:
-    """The largest choice in which no two of a group overlap: always take the one that ends first."""
+    """As many windows as possible of which no two of a group overlap: always takes the one that ends first."""
     free_from: dict[str | None, int] = {}
     chosen = []
     for number in sorted(numbers, key=lambda n: (windows[n].end, -windows[n].start, n)):
@@ -67,18 +67,17 @@ def _without_overlap(windows: list[Window], numbers: list[int], group: Callable[
 
 
 def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
-    """One episode per uninterrupted recording, cut where an excluded frame is and at `MAX_FRAMES`, with its
-    windows.
+    """One episode per uninterrupted recording with its windows, cut at excluded frames and after `MAX_FRAMES`.
 
     Raises:
         ValueError: A recording lies in no scene.
     """
-    taboo = sorted(set(excluded))
+    forbidden = sorted(set(excluded))
     starts = np.array([window.start for window in split.windows])
     ends = np.array([window.end for window in split.windows])
     spans = []
     for first, last in split.recordings.tolist():
-        cuts = [frame for frame in taboo if first <= frame <= last]
+        cuts = [frame for frame in forbidden if first <= frame <= last]
         edges = [first, *(edge for frame in cuts for edge in (frame, frame + 1)), last + 1]
         for start, end in zip(edges[::2], edges[1::2], strict=True):
             while start < end:
@@ -90,7 +89,7 @@ def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
 
 
 def _cut(start: int, end: int, starts: np.ndarray, ends: np.ndarray) -> int:
-    """Where an episode that begins at `start` ends: where no window is cut in two, if there is such a place."""
+    """Where an episode that begins at `start` ends; no window is cut in two unless it cannot be avoided."""
     if end - start <= MAX_FRAMES:
         return end
     latest = start + MAX_FRAMES
@@ -112,7 +111,7 @@ def _scene_of(split: CalvinSplit, start: int, end: int) -> str:
 
 
 def window_of_frames(span: Span, windows: list[Window]) -> np.ndarray:
-    """For each frame of an episode the window that it belongs to, the one that ends first if several cover it.
+    """The window that each frame of an episode belongs to; of several, the one that ends first.
 
     Returns:
         (n,) int64, -1 where there is none.
@@ -124,7 +123,7 @@ def window_of_frames(span: Span, windows: list[Window]) -> np.ndarray:
 
 
 def shared_frames(split: CalvinSplit) -> list[int]:
-    """Frames that both training/ and validation/ hold. The public ABCD data have four of them."""
+    """Frames that are in training/ and in validation/; the public ABCD data have four of them."""
     training, validation = split.root / "training", split.root / "validation"
     if not (training.is_dir() and validation.is_dir()):
         return []

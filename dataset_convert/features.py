@@ -1,4 +1,7 @@
-"""What a converted dataset looks like to LeRobot: its features, its videos' codecs, the files that describe it."""
+"""What a converted dataset looks like to LeRobot: its features, its videos' codecs, the files that describe it.
+
+Imports LeRobot, which takes seconds: `plan` and `finish`, which run once, use this; workers do not.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,12 +25,14 @@ from lerobot_lansar.calvin import ACTION_NAMES, CONTROL_HZ, ROBOT_OBS_NAMES, SCE
 _TASK_NAMES = [f"task_{task}" for task in TASKS]
 _NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
 
+# ---- cameras and codecs
+
 
 def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) -> tuple[Picture, ...]:
     """All camera features that these options ask for.
 
     Args:
-        images: "video", "png" or "none".
+        images: `"video"`, `"png"` or `"none"`.
         depth: Both cameras' distances too.
         tactile: The fingertip sensors too. Their depth, fractions of a millimetre, is always stored exactly.
         encoder: Of the colour videos.
@@ -37,23 +42,22 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
     """
     if images == "none":
         return ()
-    video = images == "video"
-    colours, distances = (_rgb_codec(encoder), _depth_codec()) if video else (None, None)
+    rgb_codec, depth_codec = (_rgb_codec(encoder), _depth_codec()) if images == "video" else (None, None)
     found = [
-        Picture(f"observation.images.{array.removeprefix('rgb_')}", array, slice(None), shape, colours)
+        Picture(f"observation.images.{array.removeprefix('rgb_')}", array, slice(None), shape, rgb_codec)
         for array, shape in RGB.items()
     ]
     if depth:
         found += [
-            Picture(f"observation.images.{array.removeprefix('depth_')}_depth", array, 0, (*shape, 1), distances)
+            Picture(f"observation.images.{array.removeprefix('depth_')}_depth", array, 0, (*shape, 1), depth_codec)
             for array, shape in DEPTH.items()
         ]
     if tactile:
         height, width, _ = TACTILE["rgb_tactile"]
         for finger in range(2):
             key = f"observation.images.tactile_{finger}"
-            part = slice(3 * finger, 3 * finger + 3)
-            found.append(Picture(key, "rgb_tactile", part, (height, width, 3), colours))
+            channels = slice(3 * finger, 3 * finger + 3)
+            found.append(Picture(key, "rgb_tactile", channels, (height, width, 3), rgb_codec))
             found.append(Picture(f"{key}_depth", "depth_tactile", finger, (height, width, 1)))
     return tuple(found)
 
@@ -67,7 +71,7 @@ def _rgb_config(encoder: RGBEncoder) -> RGBEncoderConfig:
 
 def _rgb_codec(encoder: RGBEncoder) -> Codec:
     config = _rgb_config(encoder)
-    # One thread per video: shards are what runs in parallel.
+    # One thread per video: shards run in parallel instead.
     return Codec(config.vcodec, config.pix_fmt, config.get_codec_options(1, as_strings=True))
 
 
@@ -77,29 +81,27 @@ def _depth_codec() -> Codec:
     return Codec(config.vcodec, config.pix_fmt, config.get_codec_options(1, as_strings=True), quantizer)
 
 
+# ---- the dataset before anything is written
+
+
 def dataset_features(action: str, pictures: tuple[Picture, ...], task_in_state: bool = False) -> dict[str, dict]:
     """LeRobot's description of the dataset's columns.
 
     Args:
-        action: "rel" or "abs", the form that `action` holds; the other one is kept as `calvin.…`, a name that
-            LeRobot does not take for something a policy should predict.
+        action: `"rel"` or `"abs"`, the form that `action` holds; the other one is kept as `calvin.actions` or
+            `calvin.rel_actions`, names that LeRobot does not take for something a policy should predict.
         pictures: Camera features.
         task_in_state: The scene's state also says which task is commanded.
 
     Returns:
-        Feature name -> {"dtype", "shape", "names"}, LeRobot's own columns (`index`, …) included.
+        Feature name to {"dtype", "shape", "names"}, LeRobot's own columns (`index`, ...) included.
     """
-
-    def vector(names: Iterable[str]) -> dict:
-        names = list(names)
-        return {"dtype": "float32", "shape": (len(names),), "names": names}
-
     other, other_form = ("calvin.actions", "abs") if action == "rel" else ("calvin.rel_actions", "rel")
     features = {
-        "observation.state": vector(ROBOT_OBS_NAMES),
-        "observation.environment_state": vector([*SCENE_OBS_NAMES, *(_TASK_NAMES if task_in_state else ())]),
-        "action": vector(ACTION_NAMES[action]),
-        other: vector(ACTION_NAMES[other_form]),
+        "observation.state": _vector(ROBOT_OBS_NAMES),
+        "observation.environment_state": _vector([*SCENE_OBS_NAMES, *(_TASK_NAMES if task_in_state else ())]),
+        "action": _vector(ACTION_NAMES[action]),
+        other: _vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
     }
     for picture in pictures:
@@ -113,8 +115,13 @@ def dataset_features(action: str, pictures: tuple[Picture, ...], task_in_state: 
     return {**features, **DEFAULT_FEATURES}
 
 
+def _vector(names: Iterable[str]) -> dict:
+    names = list(names)
+    return {"dtype": "float32", "shape": (len(names),), "names": names}
+
+
 def empty_info(action: str, pictures: tuple[Picture, ...], task_in_state: bool) -> DatasetInfo:
-    """The dataset's description before anything was written."""
+    """The dataset's description before anything is written."""
     has_videos = any(picture.codec for picture in pictures)
     return create_empty_dataset_info(
         CODEBASE_VERSION, CONTROL_HZ, dataset_features(action, pictures, task_in_state), has_videos, "panda"
@@ -127,19 +134,22 @@ def layout_of(info: DatasetInfo, pictures: tuple[Picture, ...]) -> Layout:
     return Layout(schema, pictures, info.chunks_size, DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH)
 
 
+# ---- the dataset after all shards
+
+
 def merge_stats(stats: list[Stats]) -> Stats:
     """LeRobot's `aggregate_stats` in the order of the first item; its own order differs from run to run."""
     merged = aggregate_stats(stats)
     return {key: merged[key] for key in stats[0]}
 
 
-def write_whole(
+def write_description(
     root: Path,
     info: DatasetInfo,
     layout: Layout,
     encoder: RGBEncoder,
     first_shard: int,
-    tasks: list[str],
+    sentences: list[str],
     episodes: int,
     frames: int,
     stats: Stats,
@@ -148,11 +158,11 @@ def write_whole(
 
     Args:
         root: The dataset's folder.
-        info: Of `empty_info`; its counters and its videos' properties are filled in.
-        layout: Of the frames.
-        encoder: That the colour videos were made with.
-        first_shard: Number of a shard that exists.
-        tasks: The sentences in the order of their numbers.
+        info: What `empty_info` returned; its counters and its videos' properties are filled in.
+        layout: How its files look.
+        encoder: Encoded the colour videos.
+        first_shard: Number of the first shard that has episodes.
+        sentences: The commands, in the order of their numbers.
         episodes, frames: How many there are.
         stats: Of all frames.
     """
@@ -161,8 +171,8 @@ def write_whole(
             config: Any = DepthEncoderConfig() if picture.is_depth else _rgb_config(encoder)
             found = get_video_info(root / layout.video_file(first_shard, picture.key), video_encoder=config)
             info.features[picture.key]["info"] = {**info.features[picture.key].get("info", {}), **found}
-    info.total_episodes, info.total_frames, info.total_tasks = episodes, frames, len(tasks)
+    info.total_episodes, info.total_frames, info.total_tasks = episodes, frames, len(sentences)
     info.splits = {"train": f"0:{episodes}"}
-    write_tasks(pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")), root)
+    write_tasks(pd.DataFrame({"task_index": range(len(sentences))}, index=pd.Index(sentences, name="task")), root)
     write_stats(stats, root)
     write_info(info, root)

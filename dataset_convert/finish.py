@@ -20,17 +20,17 @@ _EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.pa
 
 
 def finish(job: Job, info: Any, encoder: RGBEncoder, request: dict[str, Any], report: dict[str, Any]) -> dict[str, Any]:
-    """Writes what describes the whole dataset, in the staging folder, after all shards; may be done again.
+    """Joins all shards to one dataset in the staging folder and describes it; may be done again.
 
     Args:
-        job: Whose shards are all written.
+        job: The work, whose shards are all written.
         info: LeRobot's description.
-        encoder: Of the colour videos.
+        encoder: Encoded the colour videos.
         request: What was asked for.
         report: What else the manifest should say; `left_out` is completed here.
 
     Returns:
-        The manifest, as written to `meta/calvin_source.json`.
+        The manifest, as written to `MANIFEST`.
 
     Raises:
         ValueError: Every episode was left out.
@@ -61,13 +61,13 @@ def finish(job: Job, info: Any, encoder: RGBEncoder, request: dict[str, Any], re
     if first_shard is None:
         first = f"; the first: {left_out[0]['reason']}" if left_out else ""
         raise ValueError(f"{job.split.folder}: no episode is left to convert{first}")
-    features.write_whole(
+    features.write_description(
         job.dataset,
         info,
         job.layout,
         encoder,
         first_shard,
-        job.tasks,
+        job.sentences,
         episodes,
         frames,
         features.merge_stats(stats),
@@ -110,7 +110,7 @@ def _stats_of(table: pa.Table) -> list[Stats]:
 
 
 def _renumber(table: pa.Table, first_episode: int, first_index: int) -> pa.Table:
-    """A table of meta/episodes whose first episode and frame have these numbers."""
+    """A table of meta/episodes, numbered from these on."""
     lengths = np.array(table["length"])
     ends = first_index + np.cumsum(lengths)
     columns = {
@@ -125,13 +125,13 @@ def _renumber(table: pa.Table, first_episode: int, first_index: int) -> pa.Table
 
 
 def _renumber_frames(path: Path, first_episode: int, first_index: int) -> None:
-    """Gives the episodes and frames of one file other numbers; doing it again changes nothing."""
+    """Numbers the episodes and frames of one file from these on; doing it again changes nothing."""
     partial = path.with_suffix(".partial")
     before, episode, index = None, first_episode - 1, first_index
     with pq.ParquetFile(path) as source, pq.ParquetWriter(partial, source.schema_arrow) as target:
         for group in range(source.num_row_groups):
             table = source.read_row_group(group)
-            old = np.array(table["episode_index"])  # one episode: a row group is a block
+            old = np.array(table["episode_index"])  # all of one episode: a row group is a batch
             episode += old[0] != before
             before = old[0]
             numbers = {

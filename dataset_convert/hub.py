@@ -3,12 +3,14 @@
 import os
 from pathlib import Path
 
+from huggingface_hub import snapshot_download
 from huggingface_hub.constants import HF_HOME
+from huggingface_hub.errors import LocalEntryNotFoundError
 
 from dataset_convert import card
 
 VERSION = "v3.0"
-"""LeRobot's tag of the dataset format, by which it asks the hub for a dataset."""
+"""LeRobot's tag of the dataset format: the revision that it asks the hub for."""
 
 
 def folder_of(repo_id: str, folder: Path | None) -> Path:
@@ -22,38 +24,36 @@ def push(root: Path, repo_id: str, private: bool) -> None:
     """Uploads a dataset with LeRobot's own method, which also sets the version tag that loading needs.
 
     An interrupted upload goes on: what the hub has is not sent again. Large folders need no other method:
-    `upload_folder`, which LeRobot calls, commits them in several parts and goes on where it stopped, and the hub's
-    client deprecates `upload_large_folder` in favour of it. The version tag is set last, so that nobody loads a part.
+    `upload_folder`, which LeRobot calls, commits them in several parts and resumes, and the hub's client deprecates
+    `upload_large_folder` in favour of it. The version tag is set last, so that nobody loads an incomplete dataset.
 
     Args:
         root: The dataset's folder.
         repo_id: user/name.
         private: Whether only its owner sees it.
     """
+    # Takes seconds, and worker processes import this module.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")  # it need not look for another one
+    dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")  # named, so that it does not look for torchcodec
     dataset.push_to_hub(private=private, **card.fields(root, repo_id))
 
 
 def find_dataset(repo_id: str, folder: Path | None) -> Path:
-    """A dataset's folder: the one given, or where LeRobot 0.6 would read that name from without asking the hub.
+    """A dataset's folder: the one given, or where LeRobot 0.6 finds that name without asking the hub.
 
-    That is `$HF_LEROBOT_HOME/<repo_id>`, unless it lacks the dataset or is a download of an earlier LeRobot; then
-    the snapshot of LeRobot's version tag in the download cache `$HF_LEROBOT_HOME/hub`.
+    That is `$HF_LEROBOT_HOME/<repo_id>`, unless it lacks the dataset or is a download by an earlier LeRobot; then
+    the snapshot of `VERSION` in the download cache `$HF_LEROBOT_HOME/hub`.
 
     Args:
         repo_id: user/name.
-        folder: Given by the user; whether a dataset is in it is for the caller to see.
+        folder: Given by the user; returned unchecked.
 
     Raises:
         FileNotFoundError: No folder is given and there is neither.
     """
     if folder is not None:
         return folder
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import LocalEntryNotFoundError
-
     own, cache = folder_of(repo_id, None), folder_of("hub", None)
     if (own / "meta/info.json").is_file() and not (own / ".cache/huggingface/download").exists():
         return own
@@ -61,7 +61,7 @@ def find_dataset(repo_id: str, folder: Path | None) -> Path:
         return Path(
             snapshot_download(repo_id, repo_type="dataset", revision=VERSION, cache_dir=cache, local_files_only=True)
         )
-    except (LocalEntryNotFoundError, ValueError) as error:  # no such download; no name that the hub can have
+    except (LocalEntryNotFoundError, ValueError) as error:  # no such download; not a name that the hub allows
         raise FileNotFoundError(
             f"no dataset {repo_id} in {own}, nor among LeRobot's downloads in {cache}: give its folder as "
             f"--dataset_dir, or download it: hf download {repo_id} --repo-type=dataset --revision={VERSION} "

@@ -1,4 +1,4 @@
-"""How a converted dataset lies on disk: its camera features, frame tables, videos and manifest."""
+"""How a converted dataset lies on disk: its frame tables, camera features, videos and manifest."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,35 +7,33 @@ import numpy as np
 import pyarrow as pa
 
 MANIFEST = "meta/calvin_source.json"
-"""What a dataset was made from and how, relative to its folder."""
+"""The file, relative to the dataset's folder, that says what a dataset was made from and how."""
 
 
+# H.264 at these settings keeps pictures as well as LeRobot's default (libsvtav1, crf 30) in a tenth of the time, takes
+# a sixth more bytes, and decodes faster (docs/dataset.md).
 @dataclass
 class RGBEncoder:
-    """How videos are encoded, in LeRobot's words.
+    """How videos are encoded, in LeRobot's terms."""
 
-    H.264 at these settings keeps pictures as well as LeRobot's default (libsvtav1, crf 30) in a tenth of the time,
-    takes a sixth more bytes, and decodes faster (docs/dataset.md).
-    """
-
-    # codec, as LeRobot names it
+    # Codec, by LeRobot's name.
     vcodec: str = "h264"
-    # quality: lower is better and larger
+    # Quality: lower is better and larger.
     crf: int = 18
-    # speed against size, in the codec's words; empty: the codec's default
+    # Speed against size, one of the codec's presets; empty: the codec's default.
     preset: str = "veryfast"
-    # distance of key frames; 2 lets training jump to any frame
+    # Frames from one key frame to the next; 2 lets training jump to any frame.
     g: int = 2
 
 
 @dataclass(frozen=True)
 class Codec:
-    """How a video is encoded, in the words of FFmpeg.
+    """How a video is encoded, in FFmpeg's terms.
 
     Attributes:
-        name: Of the codec.
+        name: The codec's name.
         pix_fmt: Pixel format.
-        options: The codec's.
+        options: The codec's options.
         depth: Arguments of LeRobot's `quantize_depth`; None for colours.
     """
 
@@ -69,7 +67,7 @@ class Picture:
         return self.shape[2] == 1
 
     def of(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
-        """Its pictures among a block's arrays: (n, H, W, 3) uint8, or (n, H, W) float32 (m)."""
+        """This feature's part of CALVIN's arrays: (n, H, W, 3) uint8, or (n, H, W) float32 (m)."""
         found = arrays[self.array]
         if self.is_depth:
             found = found if found.ndim == 3 else found[..., self.channels]
@@ -108,6 +106,6 @@ class Layout:
         return self.video_path.format(video_key=key, **self.numbers(shard))
 
     def files(self, shard: int) -> list[str]:
-        """All files of a shard's frames."""
+        """The shard's frame table and videos, relative to the dataset's folder."""
         videos = [self.video_file(shard, picture.key) for picture in self.pictures if picture.codec]
         return [self.data_file(shard), *videos]

@@ -1,4 +1,4 @@
-"""The conversion's work: shards of episodes that can be written anywhere, in any order, and again."""
+"""Converts shards of episodes: anywhere, in any order, and again if their files are damaged."""
 
 import json
 from collections.abc import Iterator
@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dataset_convert import checks
-from dataset_convert.calvin import VECTORS, CalvinSplit
+from dataset_convert.calvin import VECTORS, CalvinSplit, digest
 from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
 from dataset_convert.layout import Layout
-from dataset_convert.writer import Block, Place, Written, digest, write_shard
+from dataset_convert.writer import FrameBatch, ShardPosition, Written, write_shard
 from lerobot_lansar.calvin import TASKS
 from lerobot_lansar.clip.store import sha256
 from lerobot_lansar.jobs.staging import write_atomically
@@ -22,23 +22,24 @@ from lerobot_lansar.jobs.staging import write_atomically
 DATASET, SHARDS = "dataset", "shards"
 """Folders in a staging folder: what will be published, and one note per finished shard."""
 
-BLOCK = 256
+BATCH_FRAMES = 256
 """Frames read at a time."""
 
 
 @dataclass
 class Job:
-    """Everything that a shard's work needs; it is sent to every worker.
+    """Everything that a worker needs to convert a shard; it is sent to every worker.
 
     Attributes:
         split: The source.
         folder: The staging folder.
         spans: The episodes in order.
         shards: (first, end) of each shard's episodes.
-        layout: Of the files.
-        action: "rel" or "abs".
-        block_orders: Scene -> colours of its block columns.
-        tasks: Sentences in the order of their numbers.
+        layout: How the files look.
+        action: `"rel"` or `"abs"`.
+        task_in_state: Append the commanded task to the scene's state.
+        block_orders: Scene to the colours of its block columns.
+        sentences: The commands; a frame's `task_index` is a place in this list.
         task_names, scene_names: What the numbers in `calvin.task` and `calvin.scene` mean.
         skip_bad: Leave defective episodes out instead of stopping.
     """
@@ -51,7 +52,7 @@ class Job:
     action: str
     task_in_state: bool
     block_orders: dict[str, tuple[str, ...]]
-    tasks: list[str]
+    sentences: list[str]
     task_names: list[str]
     scene_names: list[str]
     skip_bad: bool
@@ -61,8 +62,12 @@ class Job:
         """The folder that will be published."""
         return self.folder / DATASET
 
+    def episodes(self, shard: int) -> range:
+        """Numbers of a shard's episodes."""
+        return range(*self.shards[shard])
+
     def note(self, shard: int) -> Path:
-        """What a finished shard says of itself; the table of its episodes is beside it."""
+        """The file that says that a shard is finished, and how; the table of its episodes is beside it."""
         return self.folder / SHARDS / f"{shard:06d}.json"
 
     def arrays(self) -> list[str]:
@@ -70,7 +75,7 @@ class Job:
         return list(dict.fromkeys(picture.array for picture in self.layout.pictures))
 
     def limits(self) -> dict[str, tuple[float, float]]:
-        """For CALVIN's arrays that become depth videos the distances (m) that these can hold."""
+        """CALVIN's arrays that become depth videos, and the distances (m) that these can hold."""
         codecs = {picture.array: picture.codec for picture in self.layout.pictures}
         return {
             array: (codec.depth["depth_min"], codec.depth["depth_max"])
@@ -84,7 +89,7 @@ class BadEpisode(Exception):
 
     Attributes:
         number: Its number among the job's spans.
-        reason: The error it gave.
+        reason: The error that reading it gave.
     """
 
     def __init__(self, number: int, reason: Exception):
@@ -92,17 +97,25 @@ class BadEpisode(Exception):
         self.number, self.reason = number, reason
 
 
-def cut_into_shards(lengths: list[int], most: int, least: int = 16) -> list[tuple[int, int]]:
-    """Runs of whole episodes, about equally long, as (first, end).
+def staging_of(output_dir: Path) -> Path:
+    """Where a dataset is prepared: a hidden folder beside its place, on the same file system."""
+    return output_dir.parent / f".{output_dir.name}.incomplete"
 
-    The cut depends on the episodes alone, so the files are the same for any number of workers.
+
+def cut_into_shards(lengths: list[int], max_frames: int, min_shards: int = 16) -> list[tuple[int, int]]:
+    """Cuts the episodes into runs of about equally many frames.
+
+    The cuts depend on the episodes alone, so the files are the same for any number of workers.
 
     Args:
         lengths: Frames of each episode.
-        most: Frames that a shard should hold at most, when there are many.
-        least: Shards that there should be at least, when there are few episodes.
+        max_frames: A shard is closed when it reaches this many frames.
+        min_shards: Make the shards smaller to get about this many from few frames.
+
+    Returns:
+        (first, end) of each shard's episodes.
     """
-    size = min(most, -(-sum(lengths) // least))
+    size = min(max_frames, -(-sum(lengths) // min_shards))
     shards, first, frames = [], 0, 0
     for number, length in enumerate(lengths):
         frames += length
@@ -110,6 +123,19 @@ def cut_into_shards(lengths: list[int], most: int, least: int = 16) -> list[tupl
             shards.append((first, number + 1))
             first, frames = number + 1, 0
     return [*shards, (first, len(lengths))] if first < len(lengths) else shards
+
+
+def frames_done(folder: Path) -> int:
+    """Frames of all shards in a staging folder that are written."""
+    return sum(int(file.read_text() or 0) for file in (folder / SHARDS).glob("*.count"))
+
+
+def describe(span: Span) -> dict[str, Any]:
+    """An episode's place in the source, for the manifest."""
+    return {"start": span.start, "end": span.end, "scene": span.scene, "windows": list(span.windows)}
+
+
+# ---- one shard: find the bad, write the others, note
 
 
 def convert_shard(job: Job, shard: int) -> None:
@@ -122,106 +148,79 @@ def convert_shard(job: Job, shard: int) -> None:
     if note.exists() and _is_intact(job, note):
         return
     note.unlink(missing_ok=True)
-    first, end = job.shards[shard]
-    bad: dict[int, str] = {}
-    if job.skip_bad:
-        for number in range(first, end):
-            try:
-                for _ in _blocks(job, number, with_pictures=False):
-                    pass
-            except BadEpisode as error:
-                bad[number] = str(error.reason)
-    before = [len(span) for span in job.spans[:first]]
-    place = Place(shard, first, sum(before))
-    while True:
-        progress = _Progress(note.with_suffix(".count"))
-        hashes: list[str] = []
-        episodes = ((len(job.spans[n]), _hashed(job, n, progress, hashes)) for n in range(first, end) if n not in bad)
+    bad = _find_bad(job, shard) if job.skip_bad else {}
+    written, hashes = _write_others(job, shard, bad)
+    _take_note(job, shard, bad, written, hashes)
+
+
+def _is_intact(job: Job, note: Path) -> bool:
+    """Whether a finished shard's files are unchanged."""
+    content = json.loads(note.read_text())
+    table = note.with_suffix(".parquet")
+    files = {job.dataset / name: sha for name, sha in content["files"].items()}
+    return table.exists() and all(path.exists() and sha256(path) == sha for path, sha in files.items())
+
+
+def _find_bad(job: Job, shard: int) -> dict[int, str]:
+    """Episodes with defective vectors, and why; pictures take longer to read and show their defects when written."""
+    bad = {}
+    for number in job.episodes(shard):
         try:
-            written = write_shard(job.dataset, job.layout, place, episodes, job.tasks)
-            break
+            for _ in _read_batches(job, number, with_pictures=False):
+                pass
+        except BadEpisode as error:
+            bad[number] = str(error.reason)
+    return bad
+
+
+def _write_others(job: Job, shard: int, bad: dict[int, str]) -> tuple[Written, list[str]]:
+    """Writes the episodes that are not in `bad`, and adds to it those that prove defective.
+
+    Returns:
+        What was written, and the hash of each written episode's source frames.
+    """
+    first = job.shards[shard][0]
+    position = ShardPosition(shard, first, sum(len(span) for span in job.spans[:first]))
+    while True:
+        progress = _Progress(job.note(shard).with_suffix(".count"))
+        hashes: list[str] = []
+        good = (number for number in job.episodes(shard) if number not in bad)
+        episodes = ((len(job.spans[number]), _hashed(job, number, progress, hashes)) for number in good)
+        try:
+            written = write_shard(job.dataset, job.layout, position, episodes, job.sentences)
         except BadEpisode as error:
             if not job.skip_bad:
                 raise error.reason from None
-            bad[error.number] = str(error.reason)  # it was partly written: write the others again
-    progress.set(sum(len(span) for span in job.spans[first:end]))
-    kept = [number for number in range(first, end) if number not in bad]
+            bad[error.number] = str(error.reason)  # a part of it was written: write the others again
+        else:
+            progress.set(sum(len(job.spans[number]) for number in job.episodes(shard)))
+            return written, hashes
+
+
+def _take_note(job: Job, shard: int, bad: dict[int, str], written: Written, hashes: list[str]) -> None:
+    """Notes that a shard is finished: its episodes, what was left out and why, the hashes of its files."""
+    kept = [number for number in job.episodes(shard) if number not in bad]
+    files = job.layout.files(shard)
     if not kept:
-        for name in job.layout.files(shard):
+        for name in files:
             (job.dataset / name).unlink(missing_ok=True)
-    _write_rows(note.with_suffix(".parquet"), written)
+    _write_rows(job.note(shard).with_suffix(".parquet"), written)
     content = {
         "episodes": [{"number": n, "sha256": sha} for n, sha in zip(kept, hashes, strict=True)],
         "left_out": [describe(job.spans[number]) | {"reason": reason} for number, reason in bad.items()],
-        "files": {name: sha256(job.dataset / name) for name in job.layout.files(shard)} if kept else {},
+        "files": {name: sha256(job.dataset / name) for name in files} if kept else {},
     }
-    write_atomically(note, json.dumps(content))
+    write_atomically(job.note(shard), json.dumps(content))
 
 
-def _hashed(job: Job, number: int, progress: "_Progress", hashes: list[str]) -> Iterator[Block]:
-    """An episode's blocks; its hash is added to `hashes` after the last one."""
-    state = None
-    for block, arrays in _blocks(job, number, with_pictures=True):
-        state = digest(arrays, state)
-        yield block
-        progress.add(len(block.tasks))
-    assert state is not None
-    hashes.append(state.hexdigest())
-
-
-def _blocks(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[Block, dict[str, np.ndarray]]]:
-    """An episode's blocks with the source's arrays as they were read.
-
-    Raises:
-        BadEpisode: The source is defective.
-    """
-    span = job.spans[number]
-    windows = window_of_frames(span, job.split.windows)
-    keys = [*VECTORS, *(job.arrays() if with_pictures else [])]
-    for start in range(span.start, span.end, BLOCK):
-        frames = range(start, min(start + BLOCK, span.end))
-        try:
-            arrays = job.split.read(frames, keys)
-            checks.check_frames(arrays, frames, job.split, job.limits())
-        except (FileNotFoundError, ValueError) as error:
-            raise BadEpisode(number, error) from error
-        here = windows[start - span.start :][: len(frames)]
-        yield to_block(job, span, frames, here, arrays), arrays
-
-
-def to_block(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: dict[str, np.ndarray]) -> Block:
-    """A block of source frames as the dataset holds it.
-
-    Args:
-        job: What to make of them.
-        span: Their episode.
-        frames: Their numbers.
-        windows: (n,) the window each belongs to, or -1.
-        arrays: CALVIN's arrays.
-    """
-    # -1, "none", is a window that does not exist, a task and a sentence for play without a command
-    listed = job.split.windows
-    task_of = {n: job.task_names.index(listed[n].task) if n >= 0 else -1 for n in set(windows.tolist())}
-    tasks = np.array([task_of[n] for n in windows.tolist()])
-    scene = checks.reorder_blocks(arrays["scene_obs"], job.block_orders[span.scene])
-    if job.task_in_state:
-        scene = np.concatenate([scene, tasks[:, None] == np.arange(len(TASKS))], axis=1)
-    absolute = job.action == "abs"
-    other = "calvin.rel_actions" if absolute else "calvin.actions"
-    columns = {
-        "observation.state": arrays["robot_obs"],
-        "observation.environment_state": scene,
-        "action": checks.without_roll_jump(arrays["actions"]) if absolute else arrays["rel_actions"],
-        other: arrays["rel_actions" if absolute else "actions"],
-    }
-    columns = {key: column.astype(np.float32) for key, column in columns.items()}
-    sentence_of = {n: job.tasks.index(listed[n].sentence if n >= 0 else NO_COMMAND) for n in task_of}
-    columns["calvin.frame"] = np.arange(frames.start, frames.stop)
-    columns["calvin.window"] = windows
-    columns["calvin.task"] = tasks
-    columns["calvin.scene"] = np.full(len(frames), job.scene_names.index(span.scene))
-    sentences = np.array([sentence_of[n] for n in windows.tolist()])
-    return Block(columns, sentences, {key: arrays[key] for key in job.arrays() if key in arrays})
+def _write_rows(path: Path, written: Written) -> None:
+    """Writes a table of meta/episodes; `finish` renumbers it if an earlier episode was left out."""
+    table = []
+    for row, stats in zip(written.rows, written.stats, strict=True):
+        flat = {f"stats/{key}/{name}": v.tolist() for key, of in stats.items() for name, v in of.items()}
+        file = {f"meta/episodes/{name}": row[f"data/{name}"] for name in ("chunk_index", "file_index")}
+        table.append({**row, **flat, **file})
+    pq.write_table(pa.Table.from_pylist(table), path)
 
 
 class _Progress:
@@ -239,29 +238,71 @@ class _Progress:
         self._file.write_text(str(frames))
 
 
-def frames_done(folder: Path) -> int:
-    """Of all shards in a staging folder."""
-    return sum(int(file.read_text() or 0) for file in (folder / SHARDS).glob("*.count"))
+# ---- one episode: from the source's arrays to the dataset's columns
 
 
-def _is_intact(job: Job, note: Path) -> bool:
-    """Whether a finished shard's files are what they were."""
-    content = json.loads(note.read_text())
-    table = note.with_suffix(".parquet")
-    files = {job.dataset / name: sha for name, sha in content["files"].items()}
-    return table.exists() and all(path.exists() and sha256(path) == sha for path, sha in files.items())
+def _hashed(job: Job, number: int, progress: _Progress, hashes: list[str]) -> Iterator[FrameBatch]:
+    """An episode's batches; the hash of its source frames is added to `hashes` after the last one."""
+    state = None
+    for batch, arrays in _read_batches(job, number, with_pictures=True):
+        state = digest(arrays, state)
+        yield batch
+        progress.add(len(batch))
+    assert state is not None
+    hashes.append(state.hexdigest())
 
 
-def describe(span: Span) -> dict[str, Any]:
-    """An episode's place in the source, for the manifest."""
-    return {"start": span.start, "end": span.end, "scene": span.scene, "windows": list(span.windows)}
+def _read_batches(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[FrameBatch, dict[str, np.ndarray]]]:
+    """An episode's batches, each with the source's arrays as they were read.
+
+    Raises:
+        BadEpisode: The source is defective.
+    """
+    span = job.spans[number]
+    windows = window_of_frames(span, job.split.windows)
+    keys = [*VECTORS, *(job.arrays() if with_pictures else [])]
+    for start in range(span.start, span.end, BATCH_FRAMES):
+        frames = range(start, min(start + BATCH_FRAMES, span.end))
+        try:
+            arrays = job.split.read(frames, keys)
+            checks.check_frames(arrays, frames, job.split, job.limits())
+        except (FileNotFoundError, ValueError) as error:
+            raise BadEpisode(number, error) from error
+        here = windows[start - span.start :][: len(frames)]
+        yield to_batch(job, span, frames, here, arrays), arrays
 
 
-def _write_rows(path: Path, written: Written) -> None:
-    """A table of meta/episodes; the numbers in it are right as long as no episode before was left out."""
-    table = []
-    for row, stats in zip(written.rows, written.stats, strict=True):
-        flat = {f"stats/{key}/{name}": v.tolist() for key, of in stats.items() for name, v in of.items()}
-        place = {f"meta/episodes/{name}": row[f"data/{name}"] for name in ("chunk_index", "file_index")}
-        table.append({**row, **flat, **place})
-    pq.write_table(pa.Table.from_pylist(table), path)
+def to_batch(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: dict[str, np.ndarray]) -> FrameBatch:
+    """Turns n source frames into what the dataset holds.
+
+    Args:
+        job: Says how.
+        span: Their episode.
+        frames: Their numbers.
+        windows: (n,) window that each belongs to; -1 for none, a frame of play without a command.
+        arrays: CALVIN's arrays, each (n, ...).
+    """
+    listed, numbers = job.split.windows, windows.tolist()
+    task_of = {w: job.task_names.index(listed[w].task) if w >= 0 else -1 for w in set(numbers)}
+    sentence_of = {w: job.sentences.index(listed[w].sentence if w >= 0 else NO_COMMAND) for w in set(numbers)}
+    tasks = np.array([task_of[w] for w in numbers])
+    scene = checks.reorder_blocks(arrays["scene_obs"], job.block_orders[span.scene])
+    if job.task_in_state:
+        scene = np.concatenate([scene, tasks[:, None] == np.arange(len(TASKS))], axis=1)
+    is_absolute = job.action == "abs"
+    other = "rel_actions" if is_absolute else "actions"
+    vectors = {
+        "observation.state": arrays["robot_obs"],
+        "observation.environment_state": scene,
+        "action": checks.without_roll_jump(arrays["actions"]) if is_absolute else arrays["rel_actions"],
+        f"calvin.{other}": arrays[other],
+    }
+    columns = {
+        **{key: vector.astype(np.float32) for key, vector in vectors.items()},
+        "calvin.frame": np.arange(frames.start, frames.stop),
+        "calvin.window": windows,
+        "calvin.task": tasks,
+        "calvin.scene": np.full(len(frames), job.scene_names.index(span.scene)),
+    }
+    sentences = np.array([sentence_of[w] for w in numbers])
+    return FrameBatch(columns, sentences, {key: arrays[key] for key in job.arrays() if key in arrays})

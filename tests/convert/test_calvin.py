@@ -15,8 +15,9 @@ from numpy._core.multiarray import _reconstruct, scalar
 from numpy._core.numeric import _frombuffer
 
 from dataset_convert import checks
-from dataset_convert.calvin import VECTORS, CalvinSplit, load_object_array
-from lerobot_lansar.calvin import relative_action
+from dataset_convert.calvin import VECTORS, CalvinSplit
+from dataset_convert.safe_pickle import load_object_array
+from lerobot_lansar.calvin import BLOCK_ORDER, relative_action
 
 INDEX_FILES = ("scene_info.npy", "ep_start_end_ids.npy", "lang_annotations/auto_lang_ann.npy")
 
@@ -344,7 +345,7 @@ def test_an_array_packed_in_a_way_that_cannot_be_unpacked_in_steps_is_refused(ca
     with zipfile.ZipFile(calvin.file(105), "w", method) as file:
         for key in VECTORS:
             file.writestr(f"{key}.npy", bytes(200))
-    with pytest.raises(ValueError, match=r"episode_0000105\.npz.*packed by method"):
+    with pytest.raises(ValueError, match=r"episode_0000105\.npz.*compressed by method"):
         read_all(calvin)
 
 
@@ -428,7 +429,7 @@ def order_of(calvin, scene):
 
 @pytest.mark.parametrize("scene", "ABCD")
 def test_lifts_confirm_the_block_order_of_each_scene(tmp_path, scene):
-    assert order_of(write_calvin(tmp_path, scene=scene), scene) == checks.SCENE_BLOCK_ORDER[scene]
+    assert order_of(write_calvin(tmp_path, scene=scene), scene) == BLOCK_ORDER[scene]
 
 
 def test_lifts_overrule_a_known_block_order(tmp_path):

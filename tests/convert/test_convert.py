@@ -18,7 +18,8 @@ from fake_calvin import COMMANDS, write_calvin
 
 from dataset_convert import convert
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.convert import ClipOptions, ConvertConfig
+from dataset_convert.embed import ClipOptions
+from dataset_convert.options import ConvertConfig
 from lerobot_lansar.calvin import COLORS, TASKS, relative_action
 from lerobot_lansar.jobs import staging
 
@@ -53,7 +54,7 @@ def test_every_item_is_the_source_frame_with_its_command(tmp_path):
             np.testing.assert_array_equal(item["observation.state"], source["robot_obs"].astype(np.float32))
             stored = item["observation.environment_state"].numpy()
             blocks = dict(zip(("pink", "blue", "red"), source["scene_obs"][6:].reshape(3, 6), strict=True))
-            expected = np.concatenate([source["scene_obs"][:6], *(blocks[colour] for colour in COLORS)])
+            expected = np.concatenate([source["scene_obs"][:6], *(blocks[color] for color in COLORS)])
             np.testing.assert_array_equal(stored, expected.astype(np.float32))
             index += 1
 
@@ -184,13 +185,13 @@ def test_a_killed_run_leaves_nothing_that_loads_and_the_next_one_goes_on(tmp_pat
     stalled.unlink()
     os.mkfifo(stalled)
     run = converting(calvin, out, workers=2)
-    wait_for(lambda: len(list(staging.glob("shards/*.json"))) >= 5)
+    wait_for(lambda: len(list(staging.glob("shards/*.json"))) >= 5 and any(map(waits_for_a_pipe, workers_of(run.pid))))
     if whom == "everybody":
         os.killpg(run.pid, signal.SIGKILL)
     elif whom == "the parent":
         os.kill(run.pid, signal.SIGKILL)
     else:
-        os.kill(max(workers_of(run.pid), key=lambda pid: reads(pid, stalled)), signal.SIGKILL)
+        os.kill(max(workers_of(run.pid), key=waits_for_a_pipe), signal.SIGKILL)
     assert run.wait(60) != 0
     assert not out.exists()
     stalled.unlink()
@@ -247,15 +248,13 @@ def workers_of(parent):
     return found
 
 
-def reads(pid, path):
-    """Whether a process waits for a named pipe (it opens it, and that blocks)."""
+def waits_for_a_pipe(pid):
+    """Whether a process is opening a named pipe, which blocks until another process opens it too."""
     try:
-        return (
-            "fifo" in Path(f"/proc/{pid}/wchan").read_text()
-            or "wait_for_partner" in Path(f"/proc/{pid}/wchan").read_text()
-        )
+        place = Path(f"/proc/{pid}/wchan").read_text()
     except OSError:
         return False
+    return "fifo" in place or "wait_for_partner" in place
 
 
 def any_file(folder):
@@ -364,9 +363,9 @@ def test_the_command_converts_and_says_where(calvin, tmp_path, monkeypatch, caps
         (["--images=perhaps"], "--images=perhaps"),
         (["--colour=red"], "--colour=red"),
         (["--images=none", "--mode=both"], "--mode=both: expected windows or play"),
-        (["--images=none", "--mode=play", "--dedup=task"], "--dedup is for --mode=windows"),
+        (["--images=none", "--mode=play", "--dedup=task"], "--dedup needs --mode=windows"),
         (["--images=none", "--depth=true"], "--images=none"),
-        (["--images=none", "--private=true"], "--private=true is for --push_to_hub=true"),
+        (["--images=none", "--private=true"], "--private=true needs --push_to_hub=true"),
         (["--images=none", "--executor=cloud"], "--executor is one of"),
         (["--images=none", "--split=training", "--exclude_shared=perhaps"], "exclude_shared"),
     ],

@@ -11,10 +11,12 @@ from fake_calvin import write_calvin
 from huggingface_hub.utils import DEFAULT_IGNORE_PATTERNS, filter_repo_objects
 
 from dataset_convert import embed
-from dataset_convert.convert import ClipOptions, ConvertConfig, convert
-from dataset_convert.shards import sha256
+from dataset_convert.convert import convert
+from dataset_convert.embed import ClipOptions
+from dataset_convert.options import ConvertConfig
 from dataset_convert.verify import Mismatch, VerifyConfig, verify
 from lerobot_lansar.clip import store
+from lerobot_lansar.clip.store import sha256
 
 clip_module = pytest.importorskip("lerobot_lansar.clip.model")
 

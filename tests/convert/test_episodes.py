@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from fake_calvin import COMMANDS, write_calvin
 
-from dataset_convert import checks, convert, episodes
+from dataset_convert import checks, convert, episodes, plan
 from dataset_convert.calvin import CalvinSplit, Window
-from dataset_convert.convert import ConvertConfig
 from dataset_convert.episodes import NO_COMMAND, window_spans
+from dataset_convert.layout import Picture
+from dataset_convert.options import ConvertConfig
 from dataset_convert.shards import cut_into_shards
-from dataset_convert.writer import EpisodeStats, Picture
+from dataset_convert.stats import EpisodeStats
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 
 
@@ -50,11 +51,6 @@ def annotate(calvin, windows):
 
 def record_as(calvin, *recordings):
     np.save(calvin.root / "training/ep_start_end_ids.npy", np.array(recordings))
-
-
-def test_the_tasks_are_those_of_the_desk():
-    desk = pytest.importorskip("lerobot_lansar.desk")
-    assert list(desk.TASKS) == list(TASKS)
 
 
 def test_play_has_every_frame_once_and_windows_as_annotations(calvin, tmp_path):
@@ -176,9 +172,9 @@ DEFECTS = {
 @pytest.mark.parametrize("mode", ["windows", "play"])
 def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monkeypatch, capsys, defect, mode, frame):
     """Whichever of its frames it is: others are read before, the first and the last of a lift among them."""
-    monkeypatch.setattr("dataset_convert.shards.BLOCK", 5)  # it is found after a part was written
+    monkeypatch.setattr("dataset_convert.shards.BATCH_FRAMES", 5)  # it is found after a part was written
     if mode == "windows":  # good and bad ones in one file; in play a file each
-        monkeypatch.setattr(convert, "cut_into_shards", lambda lengths, most: [(0, len(lengths))])
+        monkeypatch.setattr(plan, "cut_into_shards", lambda lengths, max_frames: [(0, len(lengths))])
     calvin = write_calvin(tmp_path / "calvin", rgb=True, length=12)
     record_as(calvin, (100, 111), (112, 123), (124, 147))
     DEFECTS[defect](calvin, frame)
@@ -245,8 +241,8 @@ def test_depth_and_touch_on_request(tmp_path):
                 assert stored.shape == (1, *source[array].shape)
                 np.testing.assert_allclose(stored[0], source[array], atol=tolerance)
             for finger in range(2):
-                colours = source["rgb_tactile"][..., 3 * finger : 3 * finger + 3].transpose(2, 0, 1) / 255
-                np.testing.assert_allclose(item[f"observation.images.tactile_{finger}"], colours, atol=0.02)
+                colors = source["rgb_tactile"][..., 3 * finger : 3 * finger + 3].transpose(2, 0, 1) / 255
+                np.testing.assert_allclose(item[f"observation.images.tactile_{finger}"], colors, atol=0.02)
                 np.testing.assert_array_equal(
                     item[f"observation.images.tactile_{finger}_depth"][0],
                     source["depth_tactile"][..., finger],
@@ -276,7 +272,7 @@ def test_a_distance_that_a_depth_video_cannot_hold_makes_an_episode_defective(tm
 def test_statistics_of_a_long_recording_look_at_as_much_depth_as_lerobots(tmp_path, monkeypatch):
     from lerobot.datasets.compute_stats import get_feature_stats, sample_indices
 
-    monkeypatch.setattr("dataset_convert.shards.BLOCK", 50)
+    monkeypatch.setattr("dataset_convert.shards.BATCH_FRAMES", 50)
     calvin = write_calvin(tmp_path / "calvin", rgb=True, depth=True, tasks=("open_drawer",) * 4, length=33)
     out = convert.convert(options(calvin, tmp_path / "out", images="png", depth=True, mode="play"))
     stats = json.loads((out / "meta" / "stats.json").read_text())["observation.images.static_depth"]
@@ -308,12 +304,12 @@ def test_depth_statistics_keep_no_pictures():
 @pytest.mark.parametrize("seed", range(5))
 def test_shards_are_whole_episodes_and_alike(seed):
     lengths = np.random.default_rng(seed).integers(1, 65, 400).tolist()
-    shards = cut_into_shards(lengths, most=500)
+    shards = cut_into_shards(lengths, max_frames=500)
     assert [first for first, _ in shards[1:]] == [end for _, end in shards[:-1]]
     assert (shards[0][0], shards[-1][1]) == (0, 400)
     frames = [sum(lengths[first:end]) for first, end in shards]
     assert all(500 <= n < 565 for n in frames[:-1])
-    assert len(cut_into_shards(lengths[:20], most=500)) >= 10
+    assert len(cut_into_shards(lengths[:20], max_frames=500)) >= 10
 
 
 def paint(calvin, rng):

@@ -13,8 +13,9 @@ from fake_calvin import write_calvin
 from hub_server import TOKEN, Hub
 
 from dataset_convert import convert
-from dataset_convert.convert import ClipOptions, ConvertConfig
+from dataset_convert.embed import ClipOptions
 from dataset_convert.hub import find_dataset
+from dataset_convert.options import ConvertConfig
 
 REPOSITORY = Path(__file__).parents[2]
 

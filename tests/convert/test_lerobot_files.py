@@ -9,9 +9,10 @@ import pyarrow.parquet as pq
 import pytest
 from fake_calvin import write_calvin
 
-from dataset_convert.convert import ConvertConfig, convert
+from dataset_convert.convert import convert
 from dataset_convert.features import dataset_features, pictures_of
 from dataset_convert.layout import RGBEncoder
+from dataset_convert.options import ConvertConfig
 from dataset_convert.stats import EpisodeStats
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 

@@ -11,11 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 from fake_calvin import write_calvin
 
-from dataset_convert import checks, verify
-from dataset_convert import convert as convert_module
-from dataset_convert.convert import ConvertConfig, convert
-from dataset_convert.shards import sha256
+from dataset_convert import checks, plan, verify
+from dataset_convert.convert import convert
+from dataset_convert.episodes import Span
+from dataset_convert.options import ConvertConfig
 from dataset_convert.verify import Mismatch, VerifyConfig
+from lerobot_lansar.clip.store import sha256
 
 
 @pytest.mark.parametrize(
@@ -64,7 +65,7 @@ def made(tmp_path_factory):
     shade(source)
     out = convert(ConvertConfig(source.root, "me/desk", folder / "out"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(convert_module, "cut_into_shards", lambda lengths, most: [(0, len(lengths))])
+        patch.setattr(plan, "cut_into_shards", lambda lengths, max_frames: [(0, len(lengths))])
         one = convert(ConvertConfig(source.root, "me/desk", folder / "one"))
     return source, out, one
 
@@ -308,25 +309,25 @@ def defective(calvin, tmp_path, monkeypatch):
     [
         (lambda spans: spans[:2] + spans[3:], r"1 episodes are missing and not .*124-135, windows \[2\]"),
         (lambda spans: spans[::-1], "in another order"),
-        (lambda spans: [*spans, spans[0]], "there twice"),
+        (lambda spans: [*spans, spans[0]], "occur twice"),
         (
-            lambda spans: [*spans, verify.Span(100, 105, "D", (0,))],
+            lambda spans: [*spans, Span(100, 105, "D", (0,))],
             "not asked for; the first: frames 100-104",
         ),
     ],
     ids=["dropped", "another order", "twice", "too many"],
 )
 def test_episodes_that_the_converter_drops_or_invents_are_found(calvin, defective, change, message):
-    right = convert_module.window_spans
-    out = defective(convert_module, "window_spans", lambda *a: change(right(*a)))
+    right = plan.window_spans
+    out = defective(plan, "window_spans", lambda *a: change(right(*a)))
     with pytest.raises(Mismatch, match=message):
         verify.verify(VerifyConfig("me/desk", calvin.root, out))
 
 
 def test_a_recording_that_the_converter_drops_is_found(calvin, defective):
     np.save(calvin.root / "training/ep_start_end_ids.npy", np.array([(100, 123), (124, 147)]))
-    right = convert_module.play_spans
-    out = defective(convert_module, "play_spans", lambda *a: right(*a)[1:], mode="play")
+    right = plan.play_spans
+    out = defective(plan, "play_spans", lambda *a: right(*a)[1:], mode="play")
     with pytest.raises(Mismatch, match="1 episodes are missing and not listed"):
         verify.verify(VerifyConfig("me/desk", calvin.root, out))
 

@@ -1,0 +1,119 @@
+"""The options of `lansar-convert`."""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dataset_convert.calvin import CalvinSplit
+from dataset_convert.embed import ClipOptions
+from dataset_convert.episodes import DEDUP, MODES
+from dataset_convert.hub import folder_of
+from dataset_convert.layout import RGBEncoder
+from lerobot_lansar.calvin import CONTROL_MODES
+from lerobot_lansar.jobs.executors import check_executor
+from lerobot_lansar.jobs.work import SlurmConfig
+
+IMAGES = ("video", "png", "none")
+
+
+@dataclass
+class ConvertConfig:
+    """Converts a split of a CALVIN dataset to a LeRobotDataset v3 at 30 fps."""
+
+    # Folder of the CALVIN dataset, the one that holds training/ and validation/.
+    root: Path
+    # Name of the dataset, you/name; also its name on the hub.
+    repo_id: str
+    # Folder to create; by default where LeRobot looks for a dataset of that name.
+    output_dir: Path | None = None
+    # Split to convert: training or validation.
+    split: str = "training"
+    # windows: one episode per annotated window; play: one per uninterrupted recording, in which the annotated windows
+    # give frames their command.
+    mode: str = "windows"
+    # Overlapping windows to leave out: none, those of the same task (task), or all (frames).
+    dedup: str = "none"
+    # Leave out of training whatever contains frames that are in validation too.
+    exclude_shared: bool = False
+    # Leave out defective episodes and list them, instead of stopping at the first.
+    skip_bad: bool = False
+    # What `action` holds: rel (relative) or abs (absolute); the other form is kept in another column.
+    action: str = "rel"
+    # Tell policies that read no language which task is commanded: 34 more numbers in observation.environment_state,
+    # 1 for the commanded task and 0 for the others.
+    task_in_state: bool = False
+    # How both cameras are stored: video, png (in the parquet files) or none.
+    images: str = "video"
+    # Store both cameras' depth (m) too.
+    depth: bool = False
+    # Store the pictures of the fingertip sensors too.
+    tactile: bool = False
+    # How videos are encoded, in LeRobot's terms.
+    rgb_encoder: RGBEncoder = field(default_factory=RGBEncoder)
+    # Compute CLIP embeddings of the pictures and store them beside the data.
+    embed: bool = False
+    # Which CLIP computes the embeddings.
+    clip: ClipOptions = field(default_factory=ClipOptions)
+    # Processes that convert in parallel.
+    workers: int = 1
+    # Where they run: local, slurm or ray.
+    executor: str = "local"
+    # How jobs are submitted with --executor=slurm.
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+    # License of the data for the dataset's card, by the hub's name for it; CALVIN's is mit.
+    license: str = "mit"
+    # Upload to the hub when done.
+    push_to_hub: bool = False
+    # Make the uploaded dataset private.
+    private: bool = False
+
+    @property
+    def target(self) -> Path:
+        """The folder to create."""
+        return folder_of(self.repo_id, self.output_dir)
+
+    def check(self) -> None:
+        """Raises ValueError at an impossible option."""
+        for name, choices in (
+            ("action", CONTROL_MODES),
+            ("mode", MODES),
+            ("dedup", DEDUP),
+            ("images", IMAGES),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"--{name}={getattr(self, name)}: expected {' or '.join(choices)}")
+        if self.mode == "play" and self.dedup != "none":
+            raise ValueError("--dedup needs --mode=windows: in play every frame occurs once")
+        if self.images == "none" and (self.depth or self.tactile):
+            raise ValueError("--images=none excludes --depth and --tactile")
+        if self.exclude_shared and self.split != "training":
+            raise ValueError(f"--exclude_shared needs --split=training, not {self.split}")
+        if self.workers < 1:
+            raise ValueError(f"--workers={self.workers}: expected 1 or more")
+        if self.push_to_hub and self.repo_id.count("/") != 1:
+            raise ValueError(f"--repo_id={self.repo_id}: expected user/name to push to the hub")
+        if self.private and not self.push_to_hub:
+            raise ValueError("--private=true needs --push_to_hub=true: nothing is uploaded without it")
+        check_executor(self.executor, self.slurm)
+
+    def request(self, split: CalvinSplit) -> dict[str, Any]:
+        """Everything that decides the dataset's frames."""
+        names = (
+            "split",
+            "mode",
+            "dedup",
+            "exclude_shared",
+            "skip_bad",
+            "action",
+            "images",
+            "depth",
+            "tactile",
+        )
+        encoder = asdict(self.rgb_encoder) if self.images == "video" else None
+        return {
+            "source": self.root.resolve().name,
+            "source_sha256": split.source_sha256,
+            **{name: getattr(self, name) for name in names},
+            "rgb_encoder": encoder,
+            **({"task_in_state": True} if self.task_in_state else {}),
+        }
