@@ -3,9 +3,8 @@
     python benchmarks/convert.py [--root=DIR] [--episodes=136] [--repeat=4] [--loop_episodes=20] [--output=FILE.json]
 
 The loop is the one of LeRobot's own examples: pictures are staged as PNG files and encoded when the episode is saved.
-It is timed without its start, lansar-convert as a whole command (importing LeRobot is most of its start). Both are
-measured with the two video codecs, LeRobot's default and ours, so that what the codec gains can be told from what the
-writing gains.
+It is timed without its imports, lansar-convert as a whole command (most of its start-up is importing LeRobot). Both run
+with both video codecs, LeRobot's default and ours, to separate what the codec gains from what the writer gains.
 """
 
 import json
@@ -21,9 +20,11 @@ import draccus
 import numpy as np
 from tqdm import tqdm
 
-from dataset_convert.calvin import TASKS, CalvinSplit, load_object_array
+from dataset_convert.calvin import CalvinSplit
 from dataset_convert.features import dataset_features, pictures_of
-from dataset_convert.writer import RGBEncoder
+from dataset_convert.layout import RGBEncoder
+from dataset_convert.safe_pickle import load_object_array
+from lerobot_lansar.calvin import CONTROL_HZ, TASKS
 
 OURS = RGBEncoder()
 LEROBOTS = RGBEncoder(vcodec="libsvtav1", crf=30, preset="12")
@@ -39,10 +40,11 @@ class Options:
     root: Path | None = None
     # Episodes to record.
     episodes: int = 136
-    # How often lansar-convert gets every window, so that its start weighs as little as in a real conversion.
+    # How often lansar-convert gets every window, so that its start-up matters as little as in a real conversion.
     repeat: int = 4
-    # Episodes the loop converts.
+    # Episodes that the loop converts.
     loop_episodes: int = 20
+    # JSON file for the results.
     output: Path | None = None
 
 
@@ -60,7 +62,7 @@ def size(folder: Path) -> int:
 
 
 def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Path) -> Measured:
-    """Converts some windows as LeRobot's examples do."""
+    """Converts the first windows as LeRobot's examples do."""
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.constants import DEFAULT_FEATURES
@@ -71,7 +73,14 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
     codec = {"rgb_encoder": RGBEncoderConfig(**asdict(encoder))} if images == "video" else {}
     frames, started = 0, time.perf_counter()
     dataset = LeRobotDataset.create(
-        "benchmark/desk", 30, features, target, "panda", use_videos=images == "video", image_writer_threads=4, **codec
+        "benchmark/desk",
+        CONTROL_HZ,
+        features,
+        target,
+        "panda",
+        use_videos=images == "video",
+        image_writer_threads=4,
+        **codec,
     )
     for number, window in enumerate(tqdm(split.windows[:episodes], desc="add_frame", unit="episode", leave=False)):
         for frame in range(window.start, window.end):
@@ -94,7 +103,7 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
 
 
 def command(root: Path, encoder: RGBEncoder, images: str, workers: int, target: Path) -> Measured:
-    """Converts all with lansar-convert."""
+    """Converts all windows with lansar-convert."""
     words = [
         sys.executable,
         "-m",
@@ -114,7 +123,7 @@ def command(root: Path, encoder: RGBEncoder, images: str, workers: int, target: 
 
 
 def record(episodes: int, target: Path) -> None:
-    """Demonstrations with pictures, as lansar-record makes them."""
+    """Records demonstrations with pictures."""
     words = [
         sys.executable,
         "-m",
@@ -129,7 +138,7 @@ def record(episodes: int, target: Path) -> None:
 
 
 def repeated(root: Path, times: int, target: Path) -> None:
-    """The same folder with every window listed so many times; frames are links."""
+    """Copies a CALVIN folder with every window listed `times` times; frames are links."""
     training = target / "training"
     (training / "lang_annotations").mkdir(parents=True)
     for file in (root / "training").iterdir():
