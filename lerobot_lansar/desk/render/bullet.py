@@ -88,6 +88,6 @@ def load_egl(client: int) -> int:
     if plugin < 0:
         raise DeskError(
             "renderer pybullet_gl: pybullet's EGL plugin could not be loaded; it needs an OpenGL driver with EGL "
-            "(Debian and Ubuntu: libegl1 and a GPU driver or libgl1-mesa-dri). Renderer gl draws the same look without one"
+            "(Debian and Ubuntu: libegl1 and a GPU driver or libgl1-mesa-dri). Renderer gl has the look without one"
         )
     return plugin

@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image
 
 from . import raster, shading
+from .geometry import Clusters, corners_of, simplified
 from .software import Frame, Layer, SoftwareRenderer, pack
 from .stage import Stage
 
@@ -41,6 +42,9 @@ class OpenGLLook(SoftwareRenderer):
                 levels += chain
         self._levels, self._texels = pack(levels)
         self._textures = np.array([ranges.get(id(image), (0, 0)) for image in images], np.int64)
+        self._caster_clusters = Clusters(
+            [simplified(corners_of(group), 0.4 / TEXELS_PER_METRE) for group in stage.groups]
+        )
         self._shadow, extent = shadow_matrix()
         self._lamp = np.stack([LIGHT, HIGHLIGHT_EYE])
         poses = self._stage.poses()
@@ -65,9 +69,7 @@ class OpenGLLook(SoftwareRenderer):
         self._heights_of = self._base[3]
 
     def _surface(self, size: int) -> np.ndarray:
-        surface = np.zeros((size, size, 8), np.float32)
-        surface[..., 5] = -1e6  # far from any shadow
-        return surface
+        return np.zeros((size, size, 8), np.float32)
 
     def _shade(
         self, ids: np.ndarray, matrices: np.ndarray, rgba: np.ndarray, frame: Frame, layer: Layer | None
@@ -80,12 +82,10 @@ class OpenGLLook(SoftwareRenderer):
         shading.shade_gl(
             ids,
             frame.inverse_depth,
-            geometry.corners,
+            geometry.faces,
             matrices,
             geometry.shapes,
             self._groups,
-            geometry.normals,
-            geometry.uvs,
             self._textures,
             self._levels,
             self._texels,
@@ -99,23 +99,31 @@ class OpenGLLook(SoftwareRenderer):
             layer is not None,
             surface,
         )
+        if layer is not None:
+            layer.lit = self._lit(layer)
+
+    def _lit(self, layer: Layer) -> np.ndarray:
+        """Pixels of a layer on which a shadow can fall, (n, 3) int32: number, column and row of the shadow map there."""
+        texels = np.floor(layer.surface[..., 5:7]).reshape(-1, 2)
+        inside = ((texels >= 0) & (texels < len(self._casters) - 1)).all(-1)
+        lit = (layer.inverse_depth.ravel() > 0) & (layer.surface[..., 3].ravel() >= 0.5)
+        pixels = np.flatnonzero(inside & lit)
+        return np.column_stack([pixels, texels[pixels]]).astype(np.int32)
 
     def _relight(self, layer: Layer, ids: np.ndarray, frame: Frame) -> None:
-        shading.relight(
-            ids, layer.inverse_depth, layer.surface, self._casters, self._heights, self._touched, frame.picture
-        )
+        shading.relight(layer.lit, ids, layer.surface, self._casters, self._heights, self._touched, frame.picture)
 
     def _cast(self, groups: Sequence[int], poses: np.ndarray, heights: np.ndarray) -> np.ndarray:
         """Enters groups into the shadow map; returns first and last column, first and last row that were written."""
         touched = _NOWHERE.copy()
-        matrices, geometry = self._shadow @ poses, self._geometry
+        matrices, clusters = self._shadow @ poses, self._caster_clusters
         raster.cast(
             np.asarray(groups, np.int64),
             matrices.astype(np.float32),
             matrices[:, 2, :3],
-            geometry.ranges,
-            geometry.cones,
-            geometry.corners,
+            clusters.ranges,
+            clusters.cones,
+            clusters.corners,
             heights,
             touched,
         )

@@ -254,8 +254,7 @@ def _fill_heights(i, screen, zero, end, heights, touched):  # type: ignore[no-un
     x1 = int(np.floor(min(max(xa, xb, xc), end)))
     y0 = int(np.ceil(max(min(ya, yb, yc), zero)))
     y1 = int(np.floor(min(max(ya, yb, yc), end)))
-    share = 1 / ((xb - xa) * (yc - ya) - (xc - xa) * (yb - ya))
-    za, zb, zc = screen[2, i] * share, screen[5, i] * share, screen[8, i] * share
+    za, zb, zc, share = screen[2, i], screen[5, i], screen[8, i], np.float32(0)
     for y in range(y0, y1 + 1):
         ea0, ea1 = xb * (yc - y) - xc * (yb - y), yb - yc
         eb0, eb1 = xc * (ya - y) - xa * (yc - y), yc - ya
@@ -265,7 +264,9 @@ def _fill_heights(i, screen, zero, end, heights, touched):  # type: ignore[no-un
             eb = eb0 + x * eb1
             ec = ec0 + x * ec1
             if (ea >= 0) & (eb >= 0) & (ec >= 0):
-                height = ea * za + eb * zb + ec * zc
+                if share == 0:  # most small faces never come here
+                    share = 1 / ((xb - xa) * (yc - ya) - (xc - xa) * (yb - ya))
+                height = (ea * za + eb * zb + ec * zc) * share
                 if height > heights[y, x]:
                     heights[y, x] = height
     touched[0], touched[1] = min(touched[0], x0), max(touched[1], x1)

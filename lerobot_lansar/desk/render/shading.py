@@ -12,43 +12,46 @@ The kernels share these arguments:
 import numpy as np
 from numba import njit
 
-from .geometry import CLUSTER
 from .raster import NOTHING
 
 
-@njit(cache=True, error_model="numpy")
-def _corner(f, corner, corners, m):  # type: ignore[no-untyped-def]
-    """Column, row and w of a face's corner, with the rounding of the raster."""
-    cluster, i = corners[f // CLUSTER], f % CLUSTER
-    x, y, z = cluster[3 * corner, i], cluster[3 * corner + 1, i], cluster[3 * corner + 2, i]
-    w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / w
-    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / w
-    return float(column), float(row), float(w)
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _corner(face, i, m):  # type: ignore[no-untyped-def]
+    """Column, row and 1 / w of a face's corner, whose coordinates begin at `i`."""
+    x, y, z = face[i], face[i + 1], face[i + 2]
+    inverse_depth = 1 / (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3])
+    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * inverse_depth
+    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * inverse_depth
+    return float(column), float(row), float(inverse_depth)
 
 
-@njit(cache=True, error_model="numpy")
-def _weights(f, x, y, corners, m):  # type: ignore[no-untyped-def]
-    """Perspective weights of a face's three corners at the sample (x, y), not divided by their sum, and what each
-    grows by per column and per row."""
-    xa, ya, wa = _corner(f, 0, corners, m)
-    xb, yb, wb = _corner(f, 1, corners, m)
-    xc, yc, wc = _corner(f, 2, corners, m)
-    pa = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) / wa
-    pb = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) / wb
-    pc = ((xa - x) * (yb - y) - (xb - x) * (ya - y)) / wc
-    columns = (yb - yc) / wa, (yc - ya) / wb, (ya - yb) / wc
-    rows = (xc - xb) / wa, (xa - xc) / wb, (xb - xa) / wc
-    return pa, pb, pc, columns, rows
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _planes(face, m):  # type: ignore[no-untyped-def]
+    """For each corner of a face the plane over the picture, a + b * column + c * row, that is its perspective weight,
+    not divided by the three weights' sum."""
+    xa, ya, wa = _corner(face, 0, m)
+    xb, yb, wb = _corner(face, 3, m)
+    xc, yc, wc = _corner(face, 6, m)
+    return (
+        ((xb * yc - xc * yb) * wa, (yb - yc) * wa, (xc - xb) * wa),
+        ((xc * ya - xa * yc) * wb, (yc - ya) * wb, (xa - xc) * wb),
+        ((xa * yb - xb * ya) * wc, (ya - yb) * wc, (xb - xa) * wc),
+    )
 
 
-@njit(cache=True, error_model="numpy")
-def shade_tiny(ids, corners, matrices, shapes, groups, normals, uvs, places, texels, colors, lights, up, picture):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _mixed(face, i, step, pa, pb, pc):  # type: ignore[no-untyped-def]
+    """The weighted sum of what three corners have at `i`, `i + step` and `i + 2 * step`."""
+    return pa * face[i] + pb * face[i + step] + pc * face[i + 2 * step]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def shade_tiny(ids, faces, matrices, shapes, groups, places, texels, colors, lights, up, picture):  # type: ignore[no-untyped-def]
     """TinyRenderer's light: 60 % ambient, 35 % diffuse, 5 % specular, no shadow.
 
     Args:
-        ids, corners, matrices, groups, colors, picture: See above.
-        shapes, normals, uvs: Of the geometry.
+        ids, matrices, groups, colors, picture: See above.
+        faces, shapes: Of the geometry.
         places: (S, 3) first texel, width and height of a shape's texture; width 0 without one.
         texels: (T, 3) uint8.
         lights, up: (S, 3) direction of the light and of the world's z axis in the shape's frame.
@@ -60,12 +63,14 @@ def shade_tiny(ids, corners, matrices, shapes, groups, normals, uvs, places, tex
             if f == NOTHING:
                 continue
             shape = shapes[f]
-            pa, pb, pc, _, _ = _weights(f, x, y, corners, matrices[groups[shape]])
+            face = faces[f]
+            (a0, a1, a2), (b0, b1, b2), (c0, c1, c2) = _planes(face, matrices[groups[shape]])
+            pa, pb, pc = a0 + a1 * x + a2 * y, b0 + b1 * x + b2 * y, c0 + c1 * x + c2 * y
             total = pa + pb + pc
             pa, pb, pc = pa / total, pb / total, pc / total
             square, toward, upward, light_up = 0.0, 0.0, 0.0, 0.0
             for i in range(3):
-                n = pa * normals[f, 0, i] + pb * normals[f, 1, i] + pc * normals[f, 2, i]
+                n = _mixed(face, 9 + i, 3, pa, pb, pc)
                 square += n * n
                 toward += n * lights[shape, i]
                 upward += n * up[shape, i]
@@ -78,8 +83,7 @@ def shade_tiny(ids, corners, matrices, shapes, groups, normals, uvs, places, tex
             start, width, height = places[shape, 0], places[shape, 1], places[shape, 2]
             texel = 0
             if width > 0:
-                u = pa * uvs[f, 0, 0] + pb * uvs[f, 1, 0] + pc * uvs[f, 2, 0]
-                v = pa * uvs[f, 0, 1] + pb * uvs[f, 1, 1] + pc * uvs[f, 2, 1]
+                u, v = _mixed(face, 18, 2, pa, pb, pc), _mixed(face, 19, 2, pa, pb, pc)
                 column = min(int((u - np.floor(u)) * width), width - 1)
                 line = min(int((v - np.floor(v)) * height), height - 1)
                 texel = start + (height - 1 - line) * width + column
@@ -90,16 +94,14 @@ def shade_tiny(ids, corners, matrices, shapes, groups, normals, uvs, places, tex
                 picture[size - 1 - y, x, i] = min(int(value), 255) if value == value else 0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def shade_gl(
     ids,
     inverse_depth,
-    corners,
+    faces,
     matrices,
     shapes,
     groups,
-    normals,
-    uvs,
     places,
     levels,
     texels,
@@ -116,8 +118,8 @@ def shade_gl(
     """Bullet's OpenGL shader: a near light with highlights and a shadow, trilinear texels.
 
     Args:
-        ids, inverse_depth, corners, matrices, groups, colors, picture: See above.
-        shapes, normals, uvs: Of the geometry.
+        ids, inverse_depth, matrices, groups, colors, picture: See above.
+        faces, shapes: Of the geometry.
         places: (S, 2) first mipmap level in `levels` and number of levels, 0 without texture.
         levels: (L, 3) first texel, width and height; `texels` (T, 3) uint8.
         rotations: (G, 3, 3) of the groups.
@@ -131,21 +133,25 @@ def shade_gl(
     size = ids.shape[0]
     length = np.sqrt(lamp[0, 0] ** 2 + lamp[0, 1] ** 2 + lamp[0, 2] ** 2)
     lx, ly, lz = lamp[0, 0] / length, lamp[0, 1] / length, lamp[0, 2] / length
+    last, face, shape, turn = NOTHING, faces[0], shapes[0], rotations[0]
+    a0, a1, a2, b0, b1, b2, c0, c1, c2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for y in range(size):
         for x in range(size):
             f = ids[y, x]
             if f == NOTHING:
                 continue
-            shape = shapes[f]
-            group = groups[shape]
-            pa, pb, pc, columns, rows = _weights(f, x, y, corners, matrices[group])
+            if f != last:  # neighbours often show the same face
+                last, face, shape = f, faces[f], shapes[f]
+                group = groups[shape]
+                turn = rotations[group]
+                (a0, a1, a2), (b0, b1, b2), (c0, c1, c2) = _planes(face, matrices[group])
+            pa, pb, pc = a0 + a1 * x + a2 * y, b0 + b1 * x + b2 * y, c0 + c1 * x + c2 * y
             total = pa + pb + pc
             # the normal need not be divided by it; a face that reaches behind the eye may have a negative one
-            n0 = pa * normals[f, 0, 0] + pb * normals[f, 1, 0] + pc * normals[f, 2, 0]
-            n1 = pa * normals[f, 0, 1] + pb * normals[f, 1, 1] + pc * normals[f, 2, 1]
-            n2 = pa * normals[f, 0, 2] + pb * normals[f, 1, 2] + pc * normals[f, 2, 2]
+            n0 = _mixed(face, 9, 3, pa, pb, pc)
+            n1 = _mixed(face, 10, 3, pa, pb, pc)
+            n2 = _mixed(face, 11, 3, pa, pb, pc)
             share = (1 if total > 0 else -1) / np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            turn = rotations[group]
             nx = (turn[0, 0] * n0 + turn[0, 1] * n1 + turn[0, 2] * n2) * share
             ny = (turn[1, 0] * n0 + turn[1, 1] * n1 + turn[1, 2] * n2) * share
             nz = (turn[2, 0] * n0 + turn[2, 1] * n1 + turn[2, 2] * n2) * share
@@ -161,10 +167,10 @@ def shade_gl(
             red, green, blue = 1.0, 1.0, 1.0
             first, count = places[shape, 0], places[shape, 1]
             if count > 0:
-                u = pa * uvs[f, 0, 0] + pb * uvs[f, 1, 0] + pc * uvs[f, 2, 0]
-                v = pa * uvs[f, 0, 1] + pb * uvs[f, 1, 1] + pc * uvs[f, 2, 1]
-                u, v = u / total, v / total
-                level = _level(f, u, v, pa, pb, pc, columns, rows, uvs, levels[first, 1], levels[first, 2], count)
+                u, v = _mixed(face, 18, 2, pa, pb, pc) / total, _mixed(face, 19, 2, pa, pb, pc) / total
+                level = _level(
+                    face, u, v, (pa, pb, pc), (a1, b1, c1), (a2, b2, c2), levels[first, 1], levels[first, 2], count
+                )
                 red, green, blue = _sample(u, v, level, first, levels, texels)
             red, green, blue = red * colors[shape, 0], green * colors[shape, 1], blue * colors[shape, 2]
             light = 0.5 + 0.5 * toward
@@ -177,7 +183,7 @@ def shade_gl(
                 into[5], into[6], into[7] = s, t, height
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def _highlight(lamp, px, py, pz, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Half the cosine between the mirrored light and the way to the eye, to the power of 41."""
     ax, ay, az = lamp[0, 0] - px, lamp[0, 1] - py, lamp[0, 2] - pz
@@ -193,7 +199,7 @@ def _highlight(lamp, px, py, pz, nx, ny, nz):  # type: ignore[no-untyped-def]
     return 0.5 * c8 * c8 * c8 * c8 * c8 * cosine
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def _factor(light, highlight, s, t, height, heights):  # type: ignore[no-untyped-def]
     """What the albedo is multiplied with: light and highlight, as far as no caster is higher."""
     visible = 0.0
@@ -212,28 +218,28 @@ def _factor(light, highlight, s, t, height, heights):  # type: ignore[no-untyped
     return 0.5 + 0.5 * light * (0.7 + 0.3 * visible) + highlight * visible
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def _byte(value):  # type: ignore[no-untyped-def]
     return np.uint8(min(value, 1.0) * 255 + 0.5)
 
 
-@njit(cache=True, error_model="numpy")
-def _level(f, u, v, pa, pb, pc, columns, rows, uvs, width, height, count):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _level(face, u, v, weights, columns, rows, width, height, count):  # type: ignore[no-untyped-def]
     """Mipmap level of a pixel: log2 of the longer axis of the ellipse of texels that it covers, as GPUs have it."""
-    qa, qb, qc = pa + columns[0], pb + columns[1], pc + columns[2]
+    qa, qb, qc = weights[0] + columns[0], weights[1] + columns[1], weights[2] + columns[2]
     share = 1 / (qa + qb + qc)
-    ux = ((qa * uvs[f, 0, 0] + qb * uvs[f, 1, 0] + qc * uvs[f, 2, 0]) * share - u) * width
-    vx = ((qa * uvs[f, 0, 1] + qb * uvs[f, 1, 1] + qc * uvs[f, 2, 1]) * share - v) * height
-    qa, qb, qc = pa + rows[0], pb + rows[1], pc + rows[2]
+    ux = (_mixed(face, 18, 2, qa, qb, qc) * share - u) * width
+    vx = (_mixed(face, 19, 2, qa, qb, qc) * share - v) * height
+    qa, qb, qc = weights[0] + rows[0], weights[1] + rows[1], weights[2] + rows[2]
     share = 1 / (qa + qb + qc)
-    uy = ((qa * uvs[f, 0, 0] + qb * uvs[f, 1, 0] + qc * uvs[f, 2, 0]) * share - u) * width
-    vy = ((qa * uvs[f, 0, 1] + qb * uvs[f, 1, 1] + qc * uvs[f, 2, 1]) * share - v) * height
+    uy = (_mixed(face, 18, 2, qa, qb, qc) * share - u) * width
+    vy = (_mixed(face, 19, 2, qa, qb, qc) * share - v) * height
     along, across, mixed = ux * ux + vx * vx, uy * uy + vy * vy, ux * uy + vx * vy
     square = 0.5 * (along + across + np.sqrt((along - across) ** 2 + 4 * mixed * mixed))
     return min(max(0.5 * np.log2(max(square, 1e-12)), 0.0), count - 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 def _sample(u, v, level, first, levels, texels):  # type: ignore[no-untyped-def]
     """Trilinear texture lookup: red, green, blue, 0 to 1."""
     near = int(level)
@@ -262,35 +268,32 @@ def _sample(u, v, level, first, levels, texels):  # type: ignore[no-untyped-def]
     return red, green, blue
 
 
-@njit(cache=True, error_model="numpy")
-def relight(ids, inverse_depth, surface, before, heights, touched, picture):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def relight(lit, ids, surface, before, heights, touched, picture):  # type: ignore[no-untyped-def]
     """Colors anew the pixels of a kept layer on which the shadow has changed since it was painted.
 
     Args:
+        lit: (n, 3) int32 pixels to look at: number, and the column and row of the shadow map there.
         ids: (H, W) where a face was painted over the layer.
-        inverse_depth, surface: The layer's; see `shade_gl`.
+        surface: (H, W, 8) the layer's; see `shade_gl`.
         before, heights: (S, S) the shadow map when the layer was painted, and now.
         touched: (4,) first and last column, first and last row in which they may differ.
         picture: (H, W, 3) uint8, row 0 on top.
     """
     size = ids.shape[0]
-    for y in range(size):
-        for x in range(size):
-            s, t = surface[y, x, 5], surface[y, x, 6]
-            if s < touched[0] - 1 or s > touched[1] + 1 or t < touched[2] - 1 or t > touched[3] + 1:
-                continue
-            if ids[y, x] != NOTHING or inverse_depth[y, x] == 0 or surface[y, x, 3] < 0.5:
-                continue
-            column, row = int(np.floor(s)), int(np.floor(t))
-            if column < 0 or row < 0 or column + 1 >= heights.shape[0] or row + 1 >= heights.shape[0]:
-                continue
-            changed = heights[row, column] != before[row, column] or heights[row, column + 1] != before[row, column + 1]
-            row += 1
-            changed |= (
-                heights[row, column] != before[row, column] or heights[row, column + 1] != before[row, column + 1]
-            )
-            if changed:
+    left, right, low, high = touched[0] - 1, touched[1], touched[2] - 1, touched[3]
+    for k in range(len(lit)):
+        column, row = lit[k, 1], lit[k, 2]
+        if column < left or column > right or row < low or row > high:
+            continue
+        changed = heights[row, column] != before[row, column]
+        changed |= heights[row, column + 1] != before[row, column + 1]
+        changed |= heights[row + 1, column] != before[row + 1, column]
+        changed |= heights[row + 1, column + 1] != before[row + 1, column + 1]
+        if changed:
+            y, x = lit[k, 0] // size, lit[k, 0] % size
+            if ids[y, x] == NOTHING:
                 kept = surface[y, x]
-                factor = _factor(kept[3], kept[4], s, t, kept[7], heights)
+                factor = _factor(kept[3], kept[4], kept[5], kept[6], kept[7], heights)
                 for i in range(3):
                     picture[size - 1 - y, x, i] = _byte(kept[i] * factor)

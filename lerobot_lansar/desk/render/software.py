@@ -5,7 +5,7 @@ picture or faces away, and draw what never moves once per fixed camera.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from .stage import Stage
 
 BACKDROPS = 3
 """How many backdrops, a few MB each, are kept: one per fixed camera and picture size."""
+
+
+_NONE = np.zeros(0)
 
 
 @dataclass
@@ -46,7 +49,7 @@ class Layer:
         picture, inverse_depth: Drawn so far.
         poses, colors: Those of the camera's last picture.
         groups: Groups that are drawn, besides those that never move.
-        surface: What a look remembers of each pixel, see `_surface`.
+        surface, lit: What a look remembers of each pixel, and which of them it may have to correct.
     """
 
     picture: np.ndarray
@@ -54,7 +57,8 @@ class Layer:
     poses: np.ndarray
     colors: Colors
     groups: list[int]
-    surface: np.ndarray | None
+    surface: np.ndarray
+    lit: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 class SoftwareRenderer:
@@ -133,7 +137,7 @@ class SoftwareRenderer:
         unmoved = (frame.poses == layer.poses).all((1, 2))
         groups = [i for i in self._jointed if unmoved[i]] if frame.colors == layer.colors else []
         if groups != layer.groups:
-            surface = None if bottom.surface is None else bottom.surface.copy()
+            surface = bottom.surface.copy()
             layer = Layer(
                 bottom.picture.copy(), bottom.inverse_depth.copy(), frame.poses.copy(), frame.colors, groups, surface
             )
@@ -190,9 +194,9 @@ class SoftwareRenderer:
         middle = size / 2 - self.sample
         return np.array([[focal, 0, -middle, 0], [0, focal, -middle, 0], [0, 0, -1, 0]])
 
-    def _surface(self, size: int) -> np.ndarray | None:
-        """What a layer remembers besides its picture."""
-        return None
+    def _surface(self, size: int) -> np.ndarray:
+        """Space for what a layer remembers besides its picture."""
+        return _NONE
 
     def _prepare(self, poses: np.ndarray) -> None:
         """Called before a picture is drawn."""

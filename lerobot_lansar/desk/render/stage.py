@@ -58,22 +58,24 @@ class Stage:
             for body, link in keys
         ]
         self._poses = np.array([self._base(group.body) for group in self.groups])
-        self._rows = {
-            body: [(row, group.link) for row, group in enumerate(self.groups) if group.body == body]
-            for body in (*self._jointed, *self._free)
-        }
+        # of each body: rows of its groups, and where their links' frames are among all of the body's
+        self._rows: dict[int, tuple[list[int], list[int]]] = {}
+        for body in (*self._jointed, *self._free):
+            rows = [row for row, group in enumerate(self.groups) if group.body == body]
+            self._rows[body] = rows, [self.groups[row].link + 1 for row in rows]
+        self._positions: dict[int, list[float]] = {}
 
     def poses(self) -> np.ndarray:
         """URDF frame of every group's link in world coordinates, (groups, 4, 4); the next call overwrites the array."""
         for body, links in self._jointed.items():
             states = p.getJointStates(body, links.moving, physicsClientId=self._client)
-            frames = links.poses([state[0] for state in states])
-            for row, link in self._rows[body]:
-                self._poses[row] = frames[link + 1]
+            positions = [state[0] for state in states]
+            if positions != self._positions.get(body):  # both cameras see the same moment
+                rows, numbers = self._rows[body]
+                self._poses[rows] = links.poses(positions)[numbers]
+                self._positions[body] = positions
         for body in self._free:
-            frame = self._base(body)
-            for row, _ in self._rows[body]:
-                self._poses[row] = frame
+            self._poses[self._rows[body][0]] = self._base(body)
         return self._poses
 
     def _moves(self, body: int, link: int) -> bool:

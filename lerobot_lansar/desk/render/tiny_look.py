@@ -28,12 +28,10 @@ class TinyLook(SoftwareRenderer):
         rotations, geometry = frame.poses[self._groups, :3, :3], self._geometry
         shading.shade_tiny(
             ids,
-            geometry.corners,
+            geometry.faces,
             matrices,
             geometry.shapes,
             self._groups,
-            geometry.normals,
-            geometry.uvs,
             self._textures,
             self._texels,
             rgba,
