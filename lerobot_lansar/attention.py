@@ -33,7 +33,6 @@ from matplotlib.figure import Figure  # not pyplot: a bare figure is drawn by Ag
 from matplotlib.image import AxesImage
 
 from .command import run_command
-from .envs.configuration_calvin import CalvinEnvConfig
 from .policy.modeling_lansar import LanSARPolicy
 from .policy.network import recorded_attention
 
@@ -174,8 +173,6 @@ def observe(config: AttentionConfig) -> Attention:
     """
     check_options(config)
     set_seed(config.seed)
-    if isinstance(config.env, CalvinEnvConfig):
-        config.env.control_mode = config.policy.control_mode  # the other one cannot work
     envs = make_env(config.env, n_envs=1)
     env = next(iter(next(iter(envs.values())).values()))
     policy = make_policy(config.policy, env_cfg=config.env).eval()

@@ -50,6 +50,7 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
         "--env.type=calvin",
         "--env.task=open_drawer",
         "--env.cameras=[]",
+        "--env.control_mode=abs",
         "--env.steps_per_command=20",
         "--seed=3",
         "--decoder_steps=[0,10,99]",

@@ -154,20 +154,6 @@ def test_a_chain_is_evaluated_and_reported(run, work, lansar):
     assert list((work / "eval_chain").rglob("*.mp4"))
 
 
-def test_other_control_mode_stops_the_evaluation_with_advice(run, lansar):
-    printed = run(
-        "lerobot-eval",
-        f"--policy.path={lansar}",
-        *EVALUATION,
-        "--env.control_mode=rel",
-        "--eval.n_episodes=1",
-        "--eval.batch_size=1",
-        "--output_dir=eval_mode",
-        fails=True,
-    )
-    assert "--env.control_mode=abs" in printed
-
-
 def test_training_resumes_and_fine_tunes(run, work, dataset, lansar):
     config = f"{lansar}/train_config.json"
     run("lerobot-train", f"--config_path={config}", "--resume=true", "--steps=4")

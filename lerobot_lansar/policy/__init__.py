@@ -9,6 +9,7 @@ processor_lansar      LeRobot pipeline steps: training windows, CLIP embeddings
 windows               which steps of which demonstration a sampled frame stands for
 frames                a dataset's frames as memory-mapped arrays
 scheduler             the learning rate over a run
+card                  the text of an uploaded policy's model card
 
 LeRobot rebuilds a checkpoint's pipelines and scheduler by their registered names, so processor and scheduler are
 imported here. It imports the model itself when it builds one.

@@ -32,8 +32,8 @@ class LanSARConfig(PreTrainedConfig):
     hand, the command in the context, and windows that start anywhere in a demonstration, not only at its start.
     `configs/thesis/baseline.yaml` follows the thesis to the letter.
 
-    A resumed or fine-tuned run keeps the checkpoint's scaling statistics, because its weights depend on them. Leave
-    `target`, `orientation`, `egocentric_blocks` and `clip` as they were trained.
+    A resumed or fine-tuned run keeps the checkpoint's scaling statistics, because its weights depend on them. Options
+    that weights or scaling depend on must stay as they were trained (`TRAINED_OPTIONS` in modeling_lansar.py).
     """
 
     # Hidden size; both numbers of attention heads must divide it.
@@ -63,8 +63,8 @@ class LanSARConfig(PreTrainedConfig):
     # The command stands once at the front of the decoder's sequences instead of before every step (Table 5.3).
     command_prepended: bool = False
 
-    # How Euler angles enter the network: euler (as they are) or sincos (without the jump at +-pi, near which the
-    # gripper's roll stays). Either way the network predicts wrapped differences.
+    # How Euler angles enter the network: euler (as they are) or sincos (sines and cosines: a block's angles jump at
+    # +-pi). Either way the network predicts wrapped differences.
     orientation: str = "sincos"
     # Block positions are also given relative to the TCP, with finer resolution near it, so that the network need not
     # learn to subtract positions.
@@ -96,8 +96,9 @@ class LanSARConfig(PreTrainedConfig):
     # Share of the updates in which the learning rate rises; afterwards it falls to 0.
     warmup_fraction: float = 0.04
 
-    # What select_action returns: abs (TCP pose to go to, in m and rad) or rel (difference to the current pose in units
-    # of 0.02 m and 0.05 rad, clipped to +-1). Must equal --env.control_mode.
+    # What select_action returns where the environment does not say what it takes (--env.type=calvin does): abs (TCP
+    # pose to go to, in m and rad) or rel (difference to the current pose in units of 0.02 m and 0.05 rad, clipped to
+    # +-1).
     control_mode: str = "abs"
     # The history is cleared after this many steps, and whenever the command changes.
     history_clear_steps: int = 120
@@ -117,6 +118,8 @@ class LanSARConfig(PreTrainedConfig):
 
     # Upload the trained policy; needs --policy.repo_id=you/name.
     push_to_hub: bool = False
+    # Tags of the uploaded policy, beside robotics, lerobot and lansar.
+    tags: list[str] | None = field(default_factory=lambda: ["calvin", "lerobot_policy_lansar"])
     # Leave this as it is: LanSAR scales with its own statistics, kept in the checkpoint, so LeRobot's normaliser must
     # change nothing.
     normalization_mapping: dict[str, NormalizationMode] = field(

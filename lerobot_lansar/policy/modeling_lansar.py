@@ -1,17 +1,19 @@
 """LanSAR for LeRobot: the loss in training; at inference one action per step, with a history per environment."""
 
-import logging
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+from huggingface_hub import ModelCard
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from ..calvin import ANGLE_UNIT, CONTROL_MODES, POSITION_UNIT, wrap_angle
+from ..calvin import ANGLE_UNIT, CONTROL_MODES, GRIPPER_ACTION, POSITION_UNIT, TCP_POSE
+from .card import card_text
 from .configuration_lansar import LanSARConfig
 from .network import LanSARNetwork
 from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, VALID_STEPS
@@ -38,20 +40,25 @@ class History:
     states: Tensor
 
 
-class LossParts:
-    """Loss terms converted to floats only when read, so `forward` never synchronises the GPU.
-
-    Not a Mapping: Accelerate would recurse into it.
-    """
-
-    def __init__(self, terms: dict[str, Tensor]) -> None:
-        self._terms = {name: value.detach() for name, value in terms.items()}
-
-    def items(self) -> list[tuple[str, float]]:
-        return [(name, value.item()) for name, value in self._terms.items()]
-
-    def __len__(self) -> int:
-        return len(self._terms)
+TRAINED_OPTIONS = (
+    "hidden",
+    "context_layers",
+    "context_heads",
+    "decoder_layers",
+    "decoder_heads",
+    "feedforward",
+    "window",
+    "mlp_norm",
+    "use_images",
+    "use_spatial_context",
+    "command_in_context",
+    "command_prepended",
+    "orientation",
+    "egocentric_blocks",
+    "target",
+    "clip",
+)
+"""Options that must stay as a checkpoint was trained, because its weights or its scaling depend on them."""
 
 
 class LanSARPolicy(PreTrainedPolicy):
@@ -61,7 +68,8 @@ class LanSARPolicy(PreTrainedPolicy):
         config: All options.
         dataset_stats: Ignored: LanSAR scales with its own statistics.
         dataset_meta: Given in training only. The policy then computes its scaling statistics from all frames of the
-            dataset (a checkpoint's replace them afterwards) and gives the training windows to its preprocessor.
+            dataset (a checkpoint's replace them afterwards), gives the training windows to its preprocessor, and
+            removes the videos from this object's features, so that LeRobot does not decode them.
 
     Raises:
         ValueError, FileNotFoundError: The dataset or the options cannot be used; the message says why.
@@ -70,7 +78,8 @@ class LanSARPolicy(PreTrainedPolicy):
     config_class = LanSARConfig
     name = "lansar"
     config: LanSARConfig
-    _no_split_modules = ("EncoderLayer", "DecoderLayer")  # the units that FSDP shards
+    # The units that FSDP shards: for Accelerate, and for LeRobot after 0.6.
+    _no_split_modules = _fsdp_wrap_modules = ("EncoderLayer", "DecoderLayer")
 
     def __init__(
         self, config: LanSARConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any
@@ -81,12 +90,7 @@ class LanSARPolicy(PreTrainedPolicy):
         self.network = LanSARNetwork(config.network)
         if dataset_meta is not None:
             self._check_pretrained()
-            if any(feature["dtype"] == "video" for feature in dataset_meta.features.values()):
-                logging.warning(
-                    "LanSAR does not read this dataset's videos, but LeRobot decodes them for every sample: "
-                    "train on a copy without them (lansar-convert --images=none, with --embed=true for a policy that "
-                    "reads pictures)."
-                )
+            _drop_videos(dataset_meta.features)
             windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
             self.scaler.fit(
                 torch.tensor(windows.frames["state"]),
@@ -97,12 +101,14 @@ class LanSARPolicy(PreTrainedPolicy):
         self.reset()
 
     def _check_pretrained(self) -> None:
-        """Rejects options that would silently change what pretrained weights mean; others fail by shape."""
+        """Rejects options that pretrained weights were not made for, which LeRobot reports as shapes or not at all."""
         if not self.config.pretrained_path:
             return
-        trained = PreTrainedConfig.from_pretrained(self.config.pretrained_path)
+        trained = PreTrainedConfig.from_pretrained(
+            self.config.pretrained_path, revision=self.config.pretrained_revision
+        )
         assert isinstance(trained, LanSARConfig)
-        for name in ("target", "mlp_norm", "context_heads", "decoder_heads", "command_prepended"):
+        for name in TRAINED_OPTIONS:
             given, expected = getattr(self.config, name), getattr(trained, name)
             if given != expected:
                 raise ValueError(
@@ -117,20 +123,46 @@ class LanSARPolicy(PreTrainedPolicy):
         """Clears all histories; LeRobot calls this before each batch of episodes."""
         self._histories: list[History] = []
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, LossParts]:
-        """Loss of a batch of windows, averaged over their valid steps (Eq 4.3-4.6).
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Loss of a batch of windows (Eq 4.3-4.6).
 
         Args:
             batch: From the preprocessor, see `processor_lansar.py`.
+            reduction: "mean": the average over all valid steps. "none", for LeRobot's `--sample_weighting`: one loss
+                per window, whose average is the loss with "mean". A window's steps are therefore summed and divided by
+                the mean number of steps per window. The contrastive loss, which belongs to the whole batch, is added
+                to each.
 
         Returns:
-            The scalar loss, and its terms.
+            The loss, () or (B,); its terms, averaged over all valid steps.
 
         Raises:
-            ValueError: The batch holds no windows.
+            ValueError: The batch holds no windows, or `reduction` is neither.
         """
         if VALID_STEPS not in batch or CLIP_COMMAND not in batch:
             raise ValueError("LanSAR's forward needs windows: pass the batch through its preprocessor first.")
+        if reduction not in ("mean", "none"):
+            raise ValueError(f"reduction must be 'mean' or 'none', got {reduction!r}.")
+        # LeRobot 0.6 enters this context too; later versions only with an option of their own.
+        mixed = self.config.dtype == "bfloat16"
+        with torch.autocast(batch[OBS_STATE].device.type, torch.bfloat16) if mixed else nullcontext():
+            terms, contrast = self._loss_terms(batch)
+        steps = torch.stack(list(terms.values())).sum(dim=0)  # (N,)
+        terms = {name: values.mean() for name, values in terms.items()}
+        if reduction == "none":
+            windows, length = batch[OBS_STATE].shape[:2]
+            sums = steps.new_zeros(windows).index_add(0, batch[VALID_STEPS] // length, steps)
+            loss = sums * windows / len(steps)
+        else:
+            loss = steps.mean()
+        if contrast is not None:
+            terms["contrastive_loss"] = contrast
+            loss = loss + self.config.contrastive_weight * contrast
+        values = torch.stack(list(terms.values())).tolist()  # LeRobot logs plain numbers only; one wait for the GPU
+        return loss, dict(zip(terms, values, strict=True))
+
+    def _loss_terms(self, batch: dict[str, Any]) -> tuple[dict[str, Tensor], Tensor | None]:
+        """Every term's value at each valid step, (N,) float32; the batch's contrastive loss, if it is used."""
         valid_steps, state = batch[VALID_STEPS], batch[OBS_STATE]
         if self.training and self.config.state_noise:
             state = self._add_noise(state)
@@ -141,42 +173,39 @@ class LanSARPolicy(PreTrainedPolicy):
         )
         target = batch[ACTION].flatten(0, 1)[valid_steps]  # (N, 7)
         delta = self.scaler.scale_delta(target[:, :6])
-        beta = self.config.smooth_l1_beta
-        position = F.smooth_l1_loss(motion[:, :3], delta[:, :3], beta=beta)
-        orientation = F.smooth_l1_loss(motion[:, 3:], delta[:, 3:], beta=beta)
-        open_close = F.binary_cross_entropy_with_logits(logit, target[:, 6])
-        parts = {"position_loss": position, "orientation_loss": orientation, "gripper_loss": open_close}
-        loss = position + orientation + open_close
-        if contrast is not None:
-            parts["contrastive_loss"] = contrast
-            loss = loss + self.config.contrastive_weight * contrast
-        return loss, LossParts(parts)
+        error = F.smooth_l1_loss(motion.float(), delta, beta=self.config.smooth_l1_beta, reduction="none")
+        terms = {
+            "position_loss": error[:, :3].mean(dim=1),
+            "orientation_loss": error[:, 3:].mean(dim=1),
+            "gripper_loss": F.binary_cross_entropy_with_logits(logit.float(), target[:, 6], reduction="none"),
+        }
+        return terms, contrast
 
     def _add_noise(self, state: Tensor) -> Tensor:
-        """(B, n, 15) -> the same with normal noise of `state_noise`."""
+        """(B, n, 15) -> the same with normal noise of `state_noise`. Angles are not wrapped: that could make a jump."""
         noise = self.config.state_noise * torch.randn_like(state)
-        noise[..., -1] = 0  # the gripper action stays -1 or +1
-        state = state + noise
-        return torch.cat([state[..., :3], wrap_angle(state[..., 3:6]), state[..., 6:]], dim=-1)
+        noise[..., GRIPPER_ACTION] = 0  # stays -1 or +1
+        return state + noise
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         raise NotImplementedError("LanSAR predicts one action at a time, no action chunks: use select_action.")
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
-        """One action per environment.
+        """One action per environment, in the control mode that the environment takes.
 
         Args:
             batch: A preprocessed observation: observation.state (B, 15), observation.environment_state (B, 24),
                 observation.clip.* (B, D), task (B sentences) and, if the environment provides it,
-                observation.control_mode (B, 1).
+                observation.control_mode (B, 1): 0 for "rel", 1 for "abs". Without it, the option `control_mode` holds.
 
         Returns:
-            (B, 7) float32. "abs": TCP xyz (m) and Euler xyz (rad) to go to, gripper -1/+1. "rel": differences to the
-            current pose in units of (0.02 m, 0.05 rad) clipped to +-1, gripper -1/+1.
+            (B, 7) float32. "abs": TCP xyz (m) and Euler xyz (rad, near the state's, whatever full turns that has) to
+            go to, gripper -1/+1. "rel": differences to the current pose in units of (0.02 m, 0.05 rad) clipped to +-1,
+            gripper -1/+1.
 
         Raises:
-            ValueError: Wrong shapes, NaN, or an environment with the other control mode.
+            ValueError: Wrong shapes or NaN.
         """
         if self.training:
             self.eval()
@@ -186,7 +215,8 @@ class LanSARPolicy(PreTrainedPolicy):
         inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
         self._clear_old_histories(batch["task"])
         with torch.autocast(state.device.type, enabled=False):  # mixed precision does not speed up a single step
-            return self._act(*inputs)
+            motion, logit = self._predict(*inputs)
+            return self._to_action(state, motion, logit, batch.get("observation.control_mode"))
 
     def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor) -> None:
         sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, ENVIRONMENT_STATE_DIM))
@@ -199,16 +229,6 @@ class LanSARPolicy(PreTrainedPolicy):
                 raise ValueError(f"{name} is NaN or infinite in environment {rows} of the batch.")
         if len(batch.get("task") or ()) != len(state):
             raise ValueError("LanSAR needs one command per environment in `task`.")
-        mode = batch.get("observation.control_mode")
-        if mode is not None:
-            for value in mode.flatten().tolist():
-                env, mine = CONTROL_MODES[int(value)], self.config.control_mode
-                if env != mine:
-                    raise ValueError(
-                        f"The environment expects {env} actions (--env.control_mode={env}), but this policy returns "
-                        f"{mine} actions (--policy.control_mode={mine}). "
-                        f"Set --env.control_mode={mine} or --policy.control_mode={env}."
-                    )
 
     def _clear_old_histories(self, commands: list[str]) -> None:
         """Clears the history of each environment whose command changed or that reached `history_clear_steps`."""
@@ -224,22 +244,21 @@ class LanSARPolicy(PreTrainedPolicy):
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
         return History(command, None, 0, empty, empty)
 
-    def _act(
+    def _predict(
         self,
         state: Tensor,
         environment_state: Tensor,
         command: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
-    ) -> Tensor:
-        """Appends one step to the histories and predicts: (B, 15), (B, 24), (B, D)... -> actions (B, 7)."""
+    ) -> tuple[Tensor, Tensor]:
+        """Adds one step to the histories: (B, 15), (B, 24), (B, D)... -> scaled motion (B, 6), gripper logits (B,)."""
         x, blocks, scene = self.scaler.encode(state, environment_state)
         commands = self._encode_commands(command)
         modalities = self.network.encode_modalities(x, blocks, scene, static, gripper)
         contexts = self.network.encode_context(modalities, commands[0])  # (B, h)
         self._append(contexts, self.network.state_target(x))
-        motion, logit = self.network.predict(self._decode_newest(commands))
-        return self._to_action(state, motion, logit)
+        return self.network.predict(self._decode_newest(commands))
 
     def _encode_commands(self, command: Tensor) -> tuple[Tensor, Tensor]:
         """(B, D) -> C for memory and target, (B, h) each, computed once per history."""
@@ -276,8 +295,15 @@ class LanSARPolicy(PreTrainedPolicy):
             newest[members] = self.network.decode(contexts, states, command, cache)[:, -1]
         return newest
 
-    def _to_action(self, state: Tensor, motion: Tensor, logit: Tensor) -> Tensor:
-        """Robot state (B, 15), scaled motion (B, 6) and gripper logits (B,) -> actions (B, 7) in the control mode."""
+    def _to_action(self, state: Tensor, motion: Tensor, logit: Tensor, mode: Tensor | None) -> Tensor:
+        """Actions (B, 7).
+
+        Args:
+            state: Robot states (B, 15).
+            motion: Scaled motions (B, 6).
+            logit: Gripper logits (B,).
+            mode: Each environment's place in `CONTROL_MODES`, (B, 1); None for the option `control_mode`.
+        """
         config = self.config
         length = torch.tensor([len(history.contexts) for history in self._histories], device=state.device)
         delta = self.scaler.unscale_delta(motion)
@@ -285,7 +311,25 @@ class LanSARPolicy(PreTrainedPolicy):
         position = delta[:, :3] * scale[:, None]
         orientation = delta[:, 3:] * delta.new_tensor([1.0, 1.0, config.yaw_scale])
         gripper = torch.where(logit > 0, 1.0, -1.0)[:, None]
-        if config.control_mode == "abs":
-            return torch.cat([state[:, :3] + position, wrap_angle(state[:, 3:6] + orientation), gripper], dim=1)
-        relative = torch.cat([position / POSITION_UNIT, orientation / ANGLE_UNIT], dim=1)
-        return torch.cat([relative.clamp(-1, 1), gripper], dim=1)
+        absolute = state[:, TCP_POSE] + torch.cat([position, orientation], dim=1)
+        relative = torch.cat([position / POSITION_UNIT, orientation / ANGLE_UNIT], dim=1).clamp(-1, 1)
+        if mode is None:
+            mode = torch.full_like(gripper, CONTROL_MODES.index(config.control_mode))
+        is_absolute = mode == CONTROL_MODES.index("abs")
+        return torch.cat([torch.where(is_absolute, absolute, relative), gripper], dim=1)
+
+    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
+        """The card of an uploaded policy: LeRobot's data for the hub's search, our text."""
+        card = super().generate_model_card(*args, **kwargs)
+        card.text = card_text(self.config, kwargs.get("cfg"))
+        return card
+
+
+def _drop_videos(features: dict[str, dict]) -> None:
+    """Removes the videos from a dataset's features, in place.
+
+    LeRobot decodes every video among them for each sample, but LanSAR reads embeddings instead. The features are the
+    dataset's own, looked at for each sample. What a checkpoint holds of them was taken before.
+    """
+    for name in [name for name, feature in features.items() if feature["dtype"] == "video"]:
+        del features[name]

@@ -28,8 +28,13 @@ from typing import Any
 
 import torch
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
-from lerobot.lerobot_types import EnvTransition, TransitionKey
-from lerobot.processor import PolicyProcessorPipeline, ProcessorStep, ProcessorStepRegistry
+from lerobot.processor import (
+    EnvTransition,
+    PolicyProcessorPipeline,
+    ProcessorStep,
+    ProcessorStepRegistry,
+    TransitionKey,
+)
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
@@ -122,14 +127,7 @@ class ClipStep(ProcessorStep):
             ValueError: The policy or the dataset's embeddings were made with another CLIP.
         """
         if self._clip is None:
-            mine = ClipConfig(self.model, self.pretrained)
-            if self._windows is not None and self._windows.clip != mine:
-                raise ValueError(
-                    f"The checkpoint was trained with {mine}; --policy.clip.model={self._windows.clip.model} and "
-                    f"--policy.clip.pretrained={self._windows.clip.pretrained} cannot be changed when resuming or "
-                    "fine-tuning. Omit them."
-                )
-            clip = Clip(mine, device or "cpu", self._weights)
+            clip = Clip(ClipConfig(self.model, self.pretrained), device or "cpu", self._weights)
             made_with = {"policy was trained": self.weights_sha256}
             if self._windows is not None and self._windows.clip_info:
                 made_with["dataset's pictures were embedded"] = self._windows.clip_info["weights_sha256"]

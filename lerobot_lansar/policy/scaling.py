@@ -54,7 +54,7 @@ class Scaler(nn.Module):
             self.register_buffer(f"{name}_std", torch.ones(size))
 
     def _encode_pose(self, pose: Tensor) -> Tensor:
-        """(..., 6) xyz and Euler angles -> the same; or (..., 9) xyz, sines, cosines, which do not jump at +-pi."""
+        """(..., 6) xyz and Euler angles -> the same; or (..., 9) xyz, sines, cosines, which never jump."""
         if self.orientation == "euler":
             return pose
         position, euler = pose.split(3, dim=-1)

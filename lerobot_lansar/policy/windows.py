@@ -82,7 +82,6 @@ class Windows:
         has_target: (T,) bool, False for an episode's last frame with achieved targets.
         embeddings: {"static", "gripper"}: (total_frames, D), empty without `use_images`.
         clip_info: The contents of clip.json, empty without `use_images`.
-        clip: The policy's choice of CLIP.
         sentence_tasks: The CALVIN tasks that each sentence can mean; empty unless `paraphrases` or the contrastive
             loss need them.
 
@@ -100,7 +99,6 @@ class Windows:
             self.has_target = np.arange(len(self.targets)) < self.frames["end"] - 1
             if (self.frames["end"] - self.frames["first"] < 2).any():
                 raise ValueError("--policy.target=achieved needs episodes of at least two frames; one is shorter.")
-        self.clip = config.clip
         self.arrays: dict[str, np.ndarray | Tensor] = {
             "state": self.frames["state"],
             "environment_state": self.frames["environment_state"],

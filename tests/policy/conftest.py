@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_lansar.calvin import ACTION_NAMES, continuous_euler
+
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 torch.set_num_threads(1)
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LENGTHS = (20, 90, 9, 64)
 COMMANDS = ("open the drawer", "lift the red block", "close the drawer", "turn on the lamp")
+VIDEO = "observation.images.static"
 SMALL = {
     "device": "cpu",
     "push_to_hub": False,
@@ -50,7 +53,7 @@ def smooth_episode(rng: np.random.Generator, length: int) -> dict[str, np.ndarra
     state = np.zeros((length, 15))
     state[:, :3] = rng.normal(0, 0.1, 3) + np.cumsum(rng.normal(0, 0.004, (length, 3)), axis=0)
     state[:, 3:6] = [np.pi, 0, 1] + 0.05 * np.sin(steps[:, None] / 5 + rng.normal(0, 1, 3))
-    state[:, 3:6] = np.pi - np.mod(np.pi - state[:, 3:6], 2 * np.pi)
+    state[:, 3:6] = continuous_euler(state[:, 3:6])
     state[:, 6] = 0.04 + 0.04 * np.sin(steps / 9)
     state[:, 7:14] = rng.normal(0, 1, 7) + 0.1 * np.sin(steps[:, None] / 7)
     gripper = np.where(np.sin(steps / 6 + rng.normal()) > 0, 1.0, -1.0)
@@ -59,7 +62,7 @@ def smooth_episode(rng: np.random.Generator, length: int) -> dict[str, np.ndarra
     environment[:, 4:6] = rng.integers(0, 2, 2)
     delta = rng.uniform(-1, 1, (length, 6)) * ([0.015] * 3 + [0.04] * 3)
     absolute = np.concatenate([state[:, :6] + delta, gripper[:, None]], axis=1)
-    absolute[:, 3:6] = np.pi - np.mod(np.pi - absolute[:, 3:6], 2 * np.pi)
+    absolute[:, 3:6] = continuous_euler(absolute[:, 3:6])
     relative = np.concatenate([delta / ([0.02] * 3 + [0.05] * 3), gripper[:, None]], axis=1)
     arrays = {"state": state, "environment": environment, "abs": absolute, "rel": relative}
     return {name: value.astype(np.float32) for name, value in arrays.items()}
@@ -71,14 +74,14 @@ def make_dataset(
     lengths: tuple[int, ...] = LENGTHS,
     seed: int = 0,
     shown: tuple[tuple[int, str], ...] = (),
+    video: bool = False,
 ):
-    """Write a LeRobotDataset without pictures; returns the episodes' arrays.
+    """Write a LeRobotDataset; returns the episodes' arrays.
 
     With `shown`, the number of each episode's CALVIN task and its sentence, the dataset has the column calvin.task.
+    With `video`, it has a camera whose videos cannot be decoded; without, no pictures.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from lerobot_lansar.calvin import ACTION_NAMES
 
     def feature(size, names=None):
         return {"dtype": "float32", "shape": (size,), "names": names}
@@ -90,7 +93,9 @@ def make_dataset(
     }
     if shown:
         features["calvin.task"] = {"dtype": "int64", "shape": (1,), "names": None}
-    dataset = LeRobotDataset.create("test/desk", fps=30, features=features, root=root, use_videos=False)
+    if video:
+        features[VIDEO] = {"dtype": "video", "shape": (64, 64, 3), "names": ["height", "width", "channels"]}
+    dataset = LeRobotDataset.create("test/desk", fps=30, features=features, root=root, use_videos=video)
     rng = np.random.default_rng(seed)
     episodes = [smooth_episode(rng, length) for length in lengths]
     for i, episode in enumerate(episodes):
@@ -103,9 +108,13 @@ def make_dataset(
             }
             if shown:
                 frame["calvin.task"] = np.array([shown[i][0]])
+            if video:
+                frame[VIDEO] = np.full((64, 64, 3), t, np.uint8)
             dataset.add_frame(frame)
         dataset.save_episode()
     dataset.finalize()
+    for file in root.rglob("*.mp4"):
+        file.write_bytes(b"")
     return episodes
 
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 import yaml
 
+from lerobot_lansar.calvin import continuous_euler
+
 from .conftest import CONFIGS, dataset_meta, small_config
 
 COLOURS = ("red", "blue", "pink")
@@ -167,8 +169,10 @@ def test_the_recommended_preset_fits_32_demonstrations_and_repeats_them(tmp_path
             begun = desk.snapshot()
             policy.reset()
             for _ in range(180):
+                state = obs["robot_obs"].copy()
+                state[3:6] = continuous_euler(state[3:6])
                 seen = {
-                    "observation.state": torch.tensor(obs["robot_obs"][None], dtype=torch.float32),
+                    "observation.state": torch.tensor(state[None], dtype=torch.float32),
                     "observation.environment_state": torch.tensor(obs["scene_obs"][None], dtype=torch.float32),
                     "task": [episode["sentence"]],
                 }
