@@ -42,9 +42,8 @@ class OpenGLLook(SoftwareRenderer):
                 levels += chain
         self._levels, self._texels = pack(levels)
         self._textures = np.array([ranges.get(id(image), (0, 0)) for image in images], np.int64)
-        self._caster_clusters = Clusters(
-            [simplified(corners_of(group), 0.4 / TEXELS_PER_METRE) for group in stage.groups]
-        )
+        cell = 0.4 / TEXELS_PER_METRE  # finer detail casts no shadow of its own
+        self._caster_clusters = Clusters([simplified(corners_of(group), cell) for group in stage.groups])
         self._shadow, extent = shadow_matrix()
         self._lamp = np.stack([LIGHT, HIGHLIGHT_EYE])
         poses = self._stage.poses()
@@ -103,7 +102,7 @@ class OpenGLLook(SoftwareRenderer):
             layer.lit = self._lit(layer)
 
     def _lit(self, layer: Layer) -> np.ndarray:
-        """Pixels of a layer on which a shadow can fall, (n, 3) int32: number, column and row of the shadow map there."""
+        """Pixels of a layer on which a shadow can fall, (n, 3) int32: number, and the shadow map's column and row."""
         texels = np.floor(layer.surface[..., 5:7]).reshape(-1, 2)
         inside = ((texels >= 0) & (texels < len(self._casters) - 1)).all(-1)
         lit = (layer.inverse_depth.ravel() > 0) & (layer.surface[..., 3].ravel() >= 0.5)
