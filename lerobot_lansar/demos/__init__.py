@@ -9,4 +9,5 @@ calvin_folder    frames, windows and sentences on disk
 record_config    the options of lansar-record
 record           lansar-record: units recorded by workers, then published as two splits
 teleop           lansar-play: a person at the keyboard
+video            an mp4 written picture by picture
 """

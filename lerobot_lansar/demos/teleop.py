@@ -21,6 +21,7 @@ from ..desk import Desk, DeskError, Observation
 from ..desk.sentences import load_commands
 from ..desk.starts import sample_start
 from .calvin_folder import FrameWriter, Unit, publish_split
+from .video import Video
 
 MOVES = {
     "d": (0, 1.0),
@@ -216,36 +217,7 @@ def parse_keys(text: str) -> Iterator[tuple[str, int]]:
         yield match[1], int(match[2] or 1)
 
 
-class _Video:
-    """An mp4 that is written frame by frame and appears when it is complete."""
-
-    def __init__(self, path: Path):
-        import av
-
-        self._path, self._partial = path, path.with_name(f".{path.name}.partial.mp4")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(self._partial), "w")
-        self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ)
-        self._stream.width, self._stream.height, self._stream.pix_fmt = SIZE * 3 // 2, SIZE, "yuv420p"
-        self._frame = av.VideoFrame.from_ndarray
-
-    def add(self, picture: np.ndarray) -> None:
-        self._container.mux(self._stream.encode(self._frame(picture, format="rgb24")))
-
-    def __enter__(self) -> "_Video":
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._container.mux(self._stream.encode())
-        self._container.close()
-        if kind is None:
-            self._partial.replace(self._path)
-            print(f"video: {self._path}")
-        else:
-            self._partial.unlink(missing_ok=True)
-
-
-def press_keys(session: Session, keys: str, video: _Video | None) -> None:
+def press_keys(session: Session, keys: str, video: Video | None) -> None:
     """Presses the given keys one after the other, without a window."""
     for key, steps in tqdm(list(parse_keys(keys)), desc="playing", unit="key"):
         if key in ("space", "enter", "backspace"):
@@ -257,7 +229,7 @@ def press_keys(session: Session, keys: str, video: _Video | None) -> None:
                 video.add(session.picture())
 
 
-def drive_in_window(session: Session, pygame: Any, video: _Video | None) -> None:
+def drive_in_window(session: Session, pygame: Any, video: Video | None) -> None:
     """Drives by keyboard until ESC is pressed or the window is closed."""
     window = pygame.display.set_mode((SIZE * 3 // 2, SIZE))
     pygame.display.set_caption(f"CALVIN desk, scene {session.desk.scene.name}")
@@ -314,7 +286,7 @@ def teleoperate(config: TeleopConfig) -> Session:
         session = Session(config, desk)
         if config.output_dir is not None:  # left by a session that was killed
             shutil.rmtree(config.output_dir / STAGING, ignore_errors=True)
-        recorder: AbstractContextManager[_Video | None] = _Video(path) if path else nullcontext()
+        recorder: AbstractContextManager[Video | None] = Video(path) if path else nullcontext()
         try:
             with recorder as video:
                 if pygame is None:
