@@ -20,7 +20,14 @@ FLOORS = [
     ("lerobot_lansar.clip",),
     ("lerobot_lansar.desk", "lerobot_lansar.policy", "lerobot_lansar.report", "dataset_convert"),
     ("lerobot_lansar.demos", "lerobot_lansar.envs"),
-    ("lerobot_lansar.attention", "lerobot_lansar.cli", "lerobot_policy_lansar", "benchmarks", "scripts"),
+    (
+        "lerobot_lansar.attention",
+        "lerobot_lansar.replay",
+        "lerobot_lansar.cli",
+        "lerobot_policy_lansar",
+        "benchmarks",
+        "scripts",
+    ),
 ]
 """From the ground up. Rooms of one floor do not import each other, except on the ground and at the top."""
 
