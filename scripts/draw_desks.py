@@ -2,6 +2,8 @@
 
 python scripts/draw_desks.py                 docs/images/desks.png: the built-in desks by both cameras
 python scripts/draw_desks.py --assets=DIR    docs/images/looks.jpg as well: all renderers
+    --frame=FILE.npz                         docs/images/public_frame.png: a frame of CALVIN's public data of scene D,
+                                             as recorded, as renderer gl draws it, and the difference
 """
 
 from dataclasses import dataclass
@@ -24,6 +26,8 @@ class Options:
 
     # The `data` folder of a calvin_env checkout; without it, only the built-in desks are drawn.
     assets: Path | None = None
+    # A frame of CALVIN's public data, scene D; with --assets.
+    frame: Path | None = None
 
 
 def posed(scene: str, assets: Path | None = None, renderer: str = "gl") -> Desk:
@@ -61,9 +65,24 @@ def looks(assets: Path) -> Image.Image:
     return sheet
 
 
+def public_frame(assets: Path, file: Path) -> Image.Image:
+    """Both cameras of a recorded frame, side by side: recorded, drawn here, ten times the difference around gray."""
+    frame = np.load(file)
+    with Desk("D", assets) as desk:
+        obs = desk.reset(frame["robot_obs"], frame["scene_obs"])
+    rows = []
+    for key in ("rgb_static", "rgb_gripper"):
+        recorded, drawn = frame[key].astype(int), obs[key].astype(int)
+        shown = np.hstack([recorded, drawn, np.clip(128 + 10 * (drawn - recorded), 0, 255)]).astype(np.uint8)
+        rows.append(np.asarray(Image.fromarray(shown).resize((900, 300), Image.Resampling.NEAREST)))
+    return Image.fromarray(np.vstack(rows))
+
+
 if __name__ == "__main__":
     options = draccus.parse(Options)
     IMAGES.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.hstack([column(scene) for scene in SCENES])).save(IMAGES / "desks.png")
     if options.assets:
         looks(options.assets).save(IMAGES / "looks.jpg", quality=88)
+        if options.frame:
+            public_frame(options.assets, options.frame).save(IMAGES / "public_frame.png")
