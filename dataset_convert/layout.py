@@ -11,7 +11,7 @@ MANIFEST = "meta/calvin_source.json"
 
 
 # H.264 at these settings keeps pictures as well as LeRobot's default (libsvtav1, crf 30) in a tenth of the time, takes
-# a sixth more bytes, and decodes faster (docs/dataset.md).
+# a seventh more bytes, and decodes faster (docs/dataset.md).
 @dataclass
 class RGBEncoder:
     """How videos are encoded, in LeRobot's terms."""
