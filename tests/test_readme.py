@@ -25,6 +25,7 @@ ADDED = {
     "--policy.n_heads=2 --policy.dim_feedforward=64 --policy.pretrained_backbone_weights=null",
     "lerobot-eval": "--env.steps_per_command=5 --env.render_fps=2",
     "lerobot eval": "env.steps_per_command=5 env.render_fps=2",
+    "lansar-replay": "--output_dir=outputs/replay",
     "lansar-attention": "--env.steps_per_command=5",
 }
 """Beginning of a command to the options added to it: fewer steps, and nothing that is downloaded."""
@@ -71,6 +72,7 @@ def test_every_command_of_the_readme_runs_in_its_order_outside_the_checkout(tmp_
     for result in ("chains", "tasks", "act"):
         assert (tmp_path / "outputs/eval" / result / "episodes.jsonl").is_file()
     assert "average length" in (tmp_path / "outputs/eval/chains/report.md").read_text()
+    assert list((tmp_path / "outputs/replay").glob("*.mp4"))
     assert (tmp_path / "outputs/attention/context_attention.png").is_file()
 
 
