@@ -17,7 +17,6 @@ HIGHLIGHT_EYE = np.array([-2.0, -0.17, 0.0])
 
 TEXELS_PER_METRE = 4096 / 20
 """Of the plugin's shadow map, which spans 20 m around the origin."""
-_NOWHERE = np.array([1 << 30, -1, 1 << 30, -1])
 _NO_SURFACE = np.zeros((1, 1, 8), np.float32)
 _REGION = (-1.45, 0.85, -1.55, 0.7, 0.0, 1.3)
 """Box (m) around everything that can cast a shadow: x, y and z, lowest and highest."""
@@ -48,23 +47,23 @@ class OpenGLLook(SoftwareRenderer):
         self._lamp = np.stack([LIGHT, HIGHLIGHT_EYE])
         poses = self._stage.poses()
         self._casters = np.zeros((extent, extent), np.float32)
-        self._cast(self._still, poses, self._casters)
+        self._dirty = np.zeros((extent // raster.BLOCK + 1, extent // raster.BLOCK + 1), np.uint8)
+        self._cast(self._still, poses, self._casters, self._dirty.copy())
         # The same with the links that have not moved lately, which links they are, and where all were.
-        self._base = self._casters, _NOWHERE, list[int](), poses.copy()
-        self._heights, self._touched, self._heights_of = self._casters, _NOWHERE, np.zeros(0)
+        self._base = self._casters, self._dirty, list[int](), poses.copy()
+        self._heights, self._heights_of = self._casters, np.zeros(0)
 
     def _prepare(self, poses: np.ndarray) -> None:
         if np.array_equal(poses, self._heights_of):  # both cameras see the same shadow
             return
-        settled, touched, groups, before = self._base
-        same = (poses == before).all((1, 2))
-        if groups != (groups := [i for i in self._jointed if same[i]]):
-            settled = self._casters.copy()
-            touched = self._cast(groups, poses, settled)
-        self._base = settled, touched, groups, poses.copy()
-        self._heights = settled.copy()
-        written = self._cast([i for i in self._moving if i not in groups], poses, self._heights)
-        self._touched = np.where([True, False, True, False], np.minimum(touched, written), np.maximum(touched, written))
+        settled, dirty, groups, before = self._base
+        unmoved = (poses == before).all((1, 2))
+        if groups != (groups := [i for i in self._jointed if unmoved[i]]):
+            settled, dirty = self._casters.copy(), np.zeros_like(self._dirty)
+            self._cast(groups, poses, settled, dirty)
+        self._base = settled, dirty, groups, poses.copy()
+        self._heights, self._dirty = settled.copy(), dirty.copy()
+        self._cast([i for i in self._moving if i not in groups], poses, self._heights, self._dirty)
         self._heights_of = self._base[3]
 
     def _surface(self, size: int) -> np.ndarray:
@@ -100,6 +99,8 @@ class OpenGLLook(SoftwareRenderer):
         )
         if layer is not None:
             layer.lit = self._lit(layer)
+            layer.dark = np.empty((len(layer.lit), 3), np.uint8)
+            shading.darken(layer.lit, layer.surface, layer.dark)
 
     def _lit(self, layer: Layer) -> np.ndarray:
         """Pixels of a layer on which a shadow can fall, (n, 3) int32: number, and the shadow map's column and row."""
@@ -110,11 +111,10 @@ class OpenGLLook(SoftwareRenderer):
         return np.column_stack([pixels, texels[pixels]]).astype(np.int32)
 
     def _relight(self, layer: Layer, ids: np.ndarray, frame: Frame) -> None:
-        shading.relight(layer.lit, ids, layer.surface, self._casters, self._heights, self._touched, frame.picture)
+        shading.relight(layer.lit, layer.dark, ids, layer.surface, self._heights, self._dirty, frame.picture)
 
-    def _cast(self, groups: Sequence[int], poses: np.ndarray, heights: np.ndarray) -> np.ndarray:
-        """Enters groups into the shadow map; returns first and last column, first and last row that were written."""
-        touched = _NOWHERE.copy()
+    def _cast(self, groups: Sequence[int], poses: np.ndarray, heights: np.ndarray, dirty: np.ndarray) -> None:
+        """Enters groups into a shadow map, and marks the blocks that it writes to."""
         matrices, clusters = self._shadow @ poses, self._caster_clusters
         raster.cast(
             np.asarray(groups, np.int64),
@@ -124,9 +124,8 @@ class OpenGLLook(SoftwareRenderer):
             clusters.cones,
             clusters.corners,
             heights,
-            touched,
+            dirty,
         )
-        return touched
 
 
 def shadow_matrix() -> tuple[np.ndarray, int]:

@@ -10,6 +10,8 @@ from numba import njit
 from .geometry import CLUSTER
 
 NOTHING = -1
+BLOCK = 8
+"""Texels along each side of a block of the shadow map."""
 _VECTOR = {"contract", "arcp", "nsz"}  # what lets a compiler work on eight faces at once
 
 
@@ -216,7 +218,7 @@ def _clipped(f, i, screen, limits, min_area, rule, ranks, inverse_depth, ids):  
 
 
 @njit(cache=True, error_model="numpy")
-def cast(drawn, matrices, toward, ranges, cones, corners, heights, touched):  # type: ignore[no-untyped-def]
+def cast(drawn, matrices, toward, ranges, cones, corners, heights, dirty):  # type: ignore[no-untyped-def]
     """Enters the back faces of some groups into a shadow map (S, S) float32 of heights towards the light, m.
 
     Args:
@@ -225,7 +227,7 @@ def cast(drawn, matrices, toward, ranges, cones, corners, heights, touched):  # 
             that faces that turn their back to the light come out as fronts.
         toward: (G, 3) unit vector to the light in the group's frame.
         ranges, cones, corners: Of the geometry.
-        touched: (4,) int64 first and last column, first and last row that were written; grown here.
+        dirty: (S / BLOCK, S / BLOCK) uint8 set to 1 for blocks of texels of which one, or a neighbour, was written.
     """
     size = heights.shape[0]
     zero, end = np.float32(0), np.float32(size - 1)
@@ -244,11 +246,11 @@ def cast(drawn, matrices, toward, ranges, cones, corners, heights, touched):  # 
                     continue
                 for i in range(8 * eight, 8 * eight + 8):
                     if flags[i] != 0:
-                        _fill_heights(i, screen, zero, end, heights, touched)
+                        _fill_heights(i, screen, zero, end, heights, dirty)
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_heights(i, screen, zero, end, heights, touched):  # type: ignore[no-untyped-def]
+def _fill_heights(i, screen, zero, end, heights, dirty):  # type: ignore[no-untyped-def]
     xa, ya, xb, yb, xc, yc = screen[0, i], screen[1, i], screen[3, i], screen[4, i], screen[6, i], screen[7, i]
     x0 = int(np.ceil(max(min(xa, xb, xc), zero)))
     x1 = int(np.floor(min(max(xa, xb, xc), end)))
@@ -269,5 +271,6 @@ def _fill_heights(i, screen, zero, end, heights, touched):  # type: ignore[no-un
                 height = (ea * za + eb * zb + ec * zc) * share
                 if height > heights[y, x]:
                     heights[y, x] = height
-    touched[0], touched[1] = min(touched[0], x0), max(touched[1], x1)
-    touched[2], touched[3] = min(touched[2], y0), max(touched[3], y1)
+    for y in range(max(y0 - 1, 0) // BLOCK, y1 // BLOCK + 1):
+        for x in range(max(x0 - 1, 0) // BLOCK, x1 // BLOCK + 1):
+            dirty[y, x] = 1

@@ -9,10 +9,12 @@ The kernels share these arguments:
     picture (H, W, 3)      uint8, row 0 on top
 """
 
+import math
+
 import numpy as np
 from numba import njit
 
-from .raster import NOTHING
+from .raster import BLOCK, NOTHING
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
@@ -174,7 +176,8 @@ def shade_gl(
                 red, green, blue = _sample(u, v, level, first, levels, texels)
             red, green, blue = red * colors[shape, 0], green * colors[shape, 1], blue * colors[shape, 2]
             light = 0.5 + 0.5 * toward
-            factor = _factor(light, highlight, s, t, height, heights)
+            visible = _visible(s, t, height, heights) if light >= 0.5 else 0.0
+            factor = _factor(light, highlight, visible)
             out = picture[size - 1 - y, x]
             out[0], out[1], out[2] = _byte(red * factor), _byte(green * factor), _byte(blue * factor)
             if keep:
@@ -200,21 +203,26 @@ def _highlight(lamp, px, py, pz, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-def _factor(light, highlight, s, t, height, heights):  # type: ignore[no-untyped-def]
-    """What the albedo is multiplied with: light and highlight, as far as no caster is higher."""
-    visible = 0.0
-    if light >= 0.5:
-        extent = heights.shape[0]
-        left, low = np.floor(s), np.floor(t)
-        ds, dt = s - left, t - low
-        column, row = int(left), int(low)
-        if column < 0 or row < 0 or column + 1 >= extent or row + 1 >= extent:
-            visible = 1.0
-        else:
-            visible += (1 - ds) * (1 - dt) if height >= heights[row, column] else 0.0
-            visible += ds * (1 - dt) if height >= heights[row, column + 1] else 0.0
-            visible += (1 - ds) * dt if height >= heights[row + 1, column] else 0.0
-            visible += ds * dt if height >= heights[row + 1, column + 1] else 0.0
+def _visible(s, t, height, heights):  # type: ignore[no-untyped-def]
+    """The share of the light that no caster is in the way of, 0 to 1, between four texels of the shadow map."""
+    extent = heights.shape[0]
+    left, low = np.floor(s), np.floor(t)
+    column, row = int(left), int(low)
+    if column < 0 or row < 0 or column + 1 >= extent or row + 1 >= extent:
+        return 1.0
+    a, b = height >= heights[row, column], height >= heights[row, column + 1]
+    c, d = height >= heights[row + 1, column], height >= heights[row + 1, column + 1]
+    if a & b & c & d:
+        return 1.0
+    if not (a | b | c | d):
+        return 0.0
+    ds, dt = s - left, t - low
+    return (1 - dt) * ((1 - ds) * a + ds * b) + dt * ((1 - ds) * c + ds * d)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _factor(light, highlight, visible):  # type: ignore[no-untyped-def]
+    """What the albedo is multiplied with."""
     return 0.5 + 0.5 * light * (0.7 + 0.3 * visible) + highlight * visible
 
 
@@ -236,7 +244,10 @@ def _level(face, u, v, weights, columns, rows, width, height, count):  # type: i
     vy = (_mixed(face, 19, 2, qa, qb, qc) * share - v) * height
     along, across, mixed = ux * ux + vx * vx, uy * uy + vy * vy, ux * uy + vx * vy
     square = 0.5 * (along + across + np.sqrt((along - across) ** 2 + 4 * mixed * mixed))
-    return min(max(0.5 * np.log2(max(square, 1e-12)), 0.0), count - 1.0)
+    # log2 of the mantissa, 0.5 to 1, by a cubic: at most 0.0014 off
+    mantissa, exponent = math.frexp(max(square, 1e-12))
+    power = exponent - 3.13396 + mantissa * (6.02197 + mantissa * (1.2315 * mantissa - 4.11852))
+    return min(max(0.5 * power, 0.0), count - 1.0)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
@@ -269,31 +280,40 @@ def _sample(u, v, level, first, levels, texels):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-def relight(lit, ids, surface, before, heights, touched, picture):  # type: ignore[no-untyped-def]
-    """Colors anew the pixels of a kept layer on which the shadow has changed since it was painted.
+def relight(lit, dark, ids, surface, heights, dirty, picture):  # type: ignore[no-untyped-def]
+    """Colors anew the pixels of a kept layer on which shadows of what moves fall.
 
     Args:
-        lit: (n, 3) int32 pixels to look at: number, and the column and row of the shadow map there.
+        lit: (n, 3) int32 pixels to look at: number, and the shadow map's column and row there.
+        dark: (n, 3) uint8 their colors in full shadow.
         ids: (H, W) where a face was painted over the layer.
         surface: (H, W, 8) the layer's; see `shade_gl`.
-        before, heights: (S, S) the shadow map when the layer was painted, and now.
-        touched: (4,) first and last column, first and last row in which they may differ.
+        heights: (S, S) the shadow map.
+        dirty: Its blocks that hold more than the shadows in the layer; see `raster.cast`.
         picture: (H, W, 3) uint8, row 0 on top.
     """
     size = ids.shape[0]
-    left, right, low, high = touched[0] - 1, touched[1], touched[2] - 1, touched[3]
     for k in range(len(lit)):
-        column, row = lit[k, 1], lit[k, 2]
-        if column < left or column > right or row < low or row > high:
+        if dirty[lit[k, 2] // BLOCK, lit[k, 1] // BLOCK] == 0:
             continue
-        changed = heights[row, column] != before[row, column]
-        changed |= heights[row, column + 1] != before[row, column + 1]
-        changed |= heights[row + 1, column] != before[row + 1, column]
-        changed |= heights[row + 1, column + 1] != before[row + 1, column + 1]
-        if changed:
-            y, x = lit[k, 0] // size, lit[k, 0] % size
-            if ids[y, x] == NOTHING:
-                kept = surface[y, x]
-                factor = _factor(kept[3], kept[4], kept[5], kept[6], kept[7], heights)
-                for i in range(3):
-                    picture[size - 1 - y, x, i] = _byte(kept[i] * factor)
+        y, x = lit[k, 0] // size, lit[k, 0] % size
+        if ids[y, x] != NOTHING:
+            continue
+        kept = surface[y, x]
+        visible = _visible(kept[5], kept[6], kept[7], heights)
+        if visible == 0:
+            for i in range(3):
+                picture[size - 1 - y, x, i] = dark[k, i]
+        elif visible < 1:
+            factor = _factor(kept[3], kept[4], visible)
+            for i in range(3):
+                picture[size - 1 - y, x, i] = _byte(kept[i] * factor)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def darken(lit, surface, dark):  # type: ignore[no-untyped-def]
+    """Fills `dark`; see `relight`."""
+    for k in range(len(lit)):
+        kept = surface[lit[k, 0] // surface.shape[0], lit[k, 0] % surface.shape[0]]
+        for i in range(3):
+            dark[k, i] = _byte(kept[i] * _factor(kept[3], kept[4], 0.0))

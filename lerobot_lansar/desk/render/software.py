@@ -49,7 +49,8 @@ class Layer:
         picture, inverse_depth: Drawn so far.
         poses, colors: Those of the camera's last picture.
         groups: Groups that are drawn, besides those that never move.
-        surface, lit: What a look remembers of each pixel, and which of them it may have to correct.
+        surface, lit, dark: What a look remembers of each pixel, which ones it may have to correct, and how they look in
+            full shadow.
     """
 
     picture: np.ndarray
@@ -59,6 +60,7 @@ class Layer:
     groups: list[int]
     surface: np.ndarray
     lit: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    dark: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 class SoftwareRenderer:
@@ -105,52 +107,43 @@ class SoftwareRenderer:
             Picture (size, size, 3) uint8, and inverse depth (size, size) float32: 1 / distance along the view axis
             (1/m), 0 where there is nothing.
         """
-        poses = self._stage.poses()
-        frame = self._blank(intrinsics, self._intrinsic_matrix(intrinsics, size) @ view, size, poses, colors)
+        projection, poses = self._intrinsic_matrix(intrinsics, size) @ view, self._stage.poses()
         self._prepare(poses)
-        if fixed:
-            layer, rest = self._backdrop(frame)
-            frame.picture, frame.inverse_depth = layer.picture.copy(), layer.inverse_depth.copy()
-            ids = self._paint(rest, frame)
-            self._relight(layer, ids, frame)
-        else:
+        if not fixed:
+            frame = self._blank(intrinsics, projection, size, poses, colors)
             self._paint(range(len(self._stage.groups)), frame)
+            return frame.picture, frame.inverse_depth[::-1]
+        layer, rest = self._backdrop(intrinsics, projection, size, poses, colors)
+        picture, inverse_depth = layer.picture.copy(), layer.inverse_depth.copy()
+        frame = Frame(intrinsics, projection, poses, colors, picture, inverse_depth)
+        ids = self._paint(rest, frame)
+        self._relight(layer, ids, frame)
         return frame.picture, frame.inverse_depth[::-1]
 
-    def _backdrop(self, frame: Frame) -> tuple[Layer, list[int]]:
+    def _backdrop(
+        self, intrinsics: Intrinsics, projection: np.ndarray, size: int, poses: np.ndarray, colors: Colors
+    ) -> tuple[Layer, list[int]]:
         """What has not moved since this camera's last picture, already drawn, and the groups still to be drawn."""
-        key = len(frame.inverse_depth), frame.projection.tobytes()
+        key = size, projection.tobytes()
         if key not in self._backdrops:
             if len(self._backdrops) >= BACKDROPS:  # forget the oldest
                 del self._backdrops[next(iter(self._backdrops))]
-            bottom = Layer(
-                frame.picture,
-                frame.inverse_depth,
-                frame.poses.copy(),
-                frame.colors,
-                [],
-                self._surface(len(frame.inverse_depth)),
-            )
-            self._paint_layer(self._still, bottom, frame, {})
+            blank = self._blank(intrinsics, projection, size, poses, {})
+            bottom = Layer(blank.picture, blank.inverse_depth, poses.copy(), colors, [], self._surface(size))
+            self._paint(self._still, blank, bottom)
             self._backdrops[key] = bottom, bottom
         bottom, layer = self._backdrops[key]
-        unmoved = (frame.poses == layer.poses).all((1, 2))
-        groups = [i for i in self._jointed if unmoved[i]] if frame.colors == layer.colors else []
+        unmoved = (poses == layer.poses).all((1, 2))
+        groups = [i for i in self._jointed if unmoved[i]] if colors == layer.colors else []
         if groups != layer.groups:
-            surface = bottom.surface.copy()
-            layer = Layer(
-                bottom.picture.copy(), bottom.inverse_depth.copy(), frame.poses.copy(), frame.colors, groups, surface
-            )
-            self._paint_layer(groups, layer, frame, frame.colors)
+            picture, inverse_depth, surface = (a.copy() for a in (bottom.picture, bottom.inverse_depth, bottom.surface))
+            layer = Layer(picture, inverse_depth, poses.copy(), colors, groups, surface)
+            self._paint(groups, Frame(intrinsics, projection, poses, colors, picture, inverse_depth), layer)
         else:  # the layer's own groups have not moved: only the other groups' poses are new
-            layer.poses[:] = frame.poses
-            layer.colors = frame.colors
+            layer.poses[:] = poses
+            layer.colors = colors
         self._backdrops[key] = bottom, layer
         return layer, [i for i in self._moving if i not in groups]
-
-    def _paint_layer(self, groups: Sequence[int], layer: Layer, frame: Frame, colors: Colors) -> None:
-        part = Frame(frame.intrinsics, frame.projection, frame.poses, colors, layer.picture, layer.inverse_depth)
-        self._paint(groups, part, layer)
 
     def _paint(self, groups: Sequence[int], frame: Frame, layer: Layer | None = None) -> np.ndarray:
         """Draws groups onto a frame, which may be a layer's; returns the number of the face drawn at each pixel."""
