@@ -73,8 +73,6 @@ class OpenGLLook(SoftwareRenderer):
         self, ids: np.ndarray, matrices: np.ndarray, rgba: np.ndarray, frame: Frame, layer: Layer | None
     ) -> None:
         geometry = self._geometry
-        back = np.linalg.inv(frame.projection[:, :3])
-        world = np.column_stack([back, -back @ frame.projection[:, 3]])
         # a layer keeps what does not change: the shadow of what never moves
         heights, surface = (self._heights, _NO_SURFACE) if layer is None else (self._casters, layer.surface)
         shading.shade_gl(
@@ -89,7 +87,7 @@ class OpenGLLook(SoftwareRenderer):
             self._texels,
             rgba,
             frame.poses[:, :3, :3].copy(),
-            world,
+            frame.world,
             self._lamp,
             self._shadow,
             heights,

@@ -68,9 +68,9 @@ def _project_flat(corners, m, screen):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath=_VECTOR, inline="never")
 def _touch_samples(screen, end, min_area, flags):  # type: ignore[no-untyped-def]
-    """Flags (CLUSTER,) the faces seen from the front, of more than `min_area` doubled square pixels, whose bounding
-    box holds a sample."""
-    zero = np.float32(0)
+    """Flags (CLUSTER,) the faces that may hold a sample, seen from the front, of more than `min_area` doubled square
+    pixels. Most small faces have one sample in their bounding box and do not hold it."""
+    zero, margin = np.float32(0), np.float32(-1e-3)  # the margin is for rounding
     for i in range(CLUSTER):
         xa, ya, xb, yb, xc, yc = screen[0, i], screen[1, i], screen[3, i], screen[4, i], screen[6, i], screen[7, i]
         area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
@@ -78,7 +78,11 @@ def _touch_samples(screen, end, min_area, flags):  # type: ignore[no-untyped-def
         x1 = np.floor(min(max(max(xa, xb), xc), end))
         y0 = np.ceil(max(min(min(ya, yb), yc), zero))
         y1 = np.floor(min(max(max(ya, yb), yc), end))
-        flags[i] = (area > min_area) & (x0 <= x1) & (y0 <= y1)
+        ea = (xb - x0) * (yc - y0) - (xc - x0) * (yb - y0)
+        eb = (xc - x0) * (ya - y0) - (xa - x0) * (yc - y0)
+        ec = (xa - x0) * (yb - y0) - (xb - x0) * (ya - y0)
+        holds = (min(min(ea, eb), ec) > margin) | (x0 < x1) | (y0 < y1)
+        flags[i] = (area > min_area) & (x0 <= x1) & (y0 <= y1) & holds
 
 
 @njit(cache=True, error_model="numpy")

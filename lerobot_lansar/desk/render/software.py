@@ -30,6 +30,7 @@ class Frame:
         intrinsics: Field of view and clip planes.
         projection: (3, 4) world coordinates to homogeneous pixels (column * w, row * w, w).
         poses: (G, 4, 4) of the groups. colors: Rgba of repainted links, by (body, link).
+        world: (3, 4) homogeneous pixels (column * w, row * w, w) to world coordinates, m.
         picture: (size, size, 3) uint8. inverse_depth: (size, size) float32, 1 / w, row 0 at the bottom.
     """
 
@@ -39,6 +40,15 @@ class Frame:
     colors: Colors
     picture: np.ndarray
     inverse_depth: np.ndarray
+
+    def __post_init__(self) -> None:
+        back = np.linalg.inv(self.projection[:, :3])
+        self.world = np.column_stack([back, -back @ self.projection[:, 3]])
+
+    @property
+    def eye(self) -> np.ndarray:
+        """Where the camera is, (3,) m."""
+        return self.world[:, 3]
 
 
 @dataclass
@@ -148,12 +158,11 @@ class SoftwareRenderer:
     def _paint(self, groups: Sequence[int], frame: Frame, layer: Layer | None = None) -> np.ndarray:
         """Draws groups onto a frame, which may be a layer's; returns the number of the face drawn at each pixel."""
         ids = np.full(frame.inverse_depth.shape, raster.NOTHING, np.int32)
-        exact = frame.projection @ frame.poses
-        matrices, geometry = exact.astype(np.float32), self._geometry
+        matrices, geometry = (frame.projection @ frame.poses).astype(np.float32), self._geometry
         raster.nearest(
             np.asarray(groups, np.int64),
             matrices,
-            -np.linalg.solve(exact[:, :, :3], exact[:, :, 3:])[..., 0],
+            ((frame.eye - frame.poses[:, :3, 3])[:, None] @ frame.poses[:, :3, :3])[:, 0],
             geometry.spheres,
             geometry.ranges,
             geometry.cones,

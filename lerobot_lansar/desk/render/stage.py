@@ -63,19 +63,22 @@ class Stage:
         for body in (*self._jointed, *self._free):
             rows = [row for row, group in enumerate(self.groups) if group.body == body]
             self._rows[body] = rows, [self.groups[row].link + 1 for row in rows]
-        self._positions: dict[int, list[float]] = {}
+        self._moment: dict[int, object] = {}  # of each body: the state that its poses show
 
     def poses(self) -> np.ndarray:
         """URDF frame of every group's link in world coordinates, (groups, 4, 4); the next call overwrites the array."""
         for body, links in self._jointed.items():
             states = p.getJointStates(body, links.moving, physicsClientId=self._client)
             positions = [state[0] for state in states]
-            if positions != self._positions.get(body):  # both cameras see the same moment
+            if positions != self._moment.get(body):  # both cameras see the same moment
                 rows, numbers = self._rows[body]
                 self._poses[rows] = links.poses(positions)[numbers]
-                self._positions[body] = positions
+                self._moment[body] = positions
         for body in self._free:
-            self._poses[self._rows[body][0]] = self._base(body)
+            pose = p.getBasePositionAndOrientation(body, physicsClientId=self._client)
+            if pose != self._moment.get(body):
+                self._poses[self._rows[body][0]] = self._base(body)
+                self._moment[body] = pose
         return self._poses
 
     def _moves(self, body: int, link: int) -> bool:
