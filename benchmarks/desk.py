@@ -24,8 +24,9 @@ import numpy as np
 import pybullet as p
 from tqdm import tqdm
 
+from lerobot_lansar.cameras import STATIC_EYE, STATIC_TARGET, STATIC_UP
 from lerobot_lansar.desk import Desk, DeskError
-from lerobot_lansar.desk.cameras import INTRINSICS, STATIC_EYE, STATIC_TARGET, STATIC_UP
+from lerobot_lansar.desk.cameras import INTRINSICS
 
 ROUNDS = 5
 

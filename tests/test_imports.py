@@ -12,6 +12,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = [
     (
         "lerobot_lansar.calvin",
+        "lerobot_lansar.cameras",
+        "lerobot_lansar.pictures",
         "lerobot_lansar.benchmark",
         "lerobot_lansar.command",
         "lerobot_lansar.jobs",

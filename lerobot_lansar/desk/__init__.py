@@ -6,7 +6,7 @@ assets           the URDF files to load: a calvin_env checkout's, or generated o
 builtin          how URDFs are generated from a scene's numbers
 robot            the Panda: inverse kinematics, position control, `robot_obs`
 furniture        the desk's joints and lights, and the blocks: `scene_obs`
-cameras          where the two cameras are and what they see
+cameras          the two cameras' clip planes and view matrices
 render/          pictures: our two renderers and PyBullet's two
 oracle           which tasks were fulfilled between two moments
 starts           random start states in which a task is feasible

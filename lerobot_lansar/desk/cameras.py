@@ -1,4 +1,4 @@
-"""CALVIN's two cameras; eye, target and field of view are those of calvin_env's configuration."""
+"""CALVIN's two cameras as the renderers need them. `lerobot_lansar.cameras` says where they are."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import numpy as np
 import pybullet as p
 
 from ..calvin import CAMERAS
+from ..cameras import FIELD_OF_VIEW, STATIC_EYE, STATIC_TARGET, STATIC_UP
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,9 @@ class Intrinsics:
 
 
 INTRINSICS = {
-    "static": Intrinsics(size=CAMERAS["static"], fov=10.0, near=0.01, far=10.0),
-    "gripper": Intrinsics(size=CAMERAS["gripper"], fov=75.0, near=0.01, far=2.0),
+    "static": Intrinsics(size=CAMERAS["static"], fov=FIELD_OF_VIEW["static"], near=0.01, far=10.0),
+    "gripper": Intrinsics(size=CAMERAS["gripper"], fov=FIELD_OF_VIEW["gripper"], near=0.01, far=2.0),
 }
-
-STATIC_EYE = (2.871459009488717, -2.166602199425597, 2.555159848480571)
-STATIC_TARGET = (-0.026242351159453392, -0.0302329882979393, 0.3920000493526459)
-STATIC_UP = (0.4041403970338857, 0.22629790978217404, 0.8862616969685161)
 
 
 def static_view() -> np.ndarray:

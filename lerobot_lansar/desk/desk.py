@@ -10,6 +10,7 @@ import numpy as np
 import pybullet as p
 
 from ..calvin import CAMERAS, COLORS, FURNITURE, block_pose
+from ..cameras import Camera, gripper_camera_pose, intrinsics, static_camera_pose
 from .assets import Assets, find_assets
 from .cameras import INTRINSICS, gripper_view, static_view
 from .errors import DeskError, SimulationError
@@ -226,6 +227,19 @@ class Desk:
         """Distance along the camera's axis, (size, size) float32 m; where there is nothing, that of the far plane."""
         return _depth(camera, self._draw(camera, size)[1])
 
+    def camera(self, name: str = "static", size: int | None = None) -> Camera:
+        """What a camera sees, and from where it draws the present state.
+
+        Args:
+            name: `"static"` or `"gripper"`.
+            size: Width and height of the picture, pixels; the camera's own by default.
+        """
+        self._require_open()
+        _check_cameras((name,))
+        size = _pixels(name, size)
+        pose = static_camera_pose() if name == "static" else gripper_camera_pose(self._robot.observe())
+        return Camera(name, size, intrinsics(name, size), pose)
+
     def snapshot(self) -> Snapshot:
         """The present state as the task oracle needs it."""
         self._require_open()
@@ -287,11 +301,8 @@ class Desk:
             self._renderer = open_renderer(self.renderer, self._client, lights, self._egl_plugin)
         fixed = camera == "static"
         view = static_view() if fixed else gripper_view(*self._robot.camera_pose())
-        intrinsics = INTRINSICS[camera]
-        pixels = intrinsics.size if size is None else size
-        if not isinstance(pixels, int | np.integer) or pixels < 1:
-            raise DeskError(f"size must be a positive number of pixels, got {size!r}")
-        return self._renderer.draw(intrinsics, view, int(pixels), self._furniture.light_colors(), fixed)
+        colors = self._furniture.light_colors()
+        return self._renderer.draw(INTRINSICS[camera], view, _pixels(camera, size), colors, fixed)
 
     def _advance(self, action: np.ndarray, control_mode: str) -> None:
         self._actions.append((action, control_mode))
@@ -355,6 +366,14 @@ def _check_cameras(cameras: Sequence[str]) -> None:
     for camera in cameras:
         if camera not in CAMERAS:
             raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+
+
+def _pixels(camera: str, size: int | None) -> int:
+    """Width and height of a camera's picture of that size; the camera's own by default."""
+    pixels = CAMERAS[camera] if size is None else size
+    if not isinstance(pixels, int | np.integer) or pixels < 1:
+        raise DeskError(f"size must be a positive number of pixels, got {size!r}")
+    return int(pixels)
 
 
 def _depth(camera: str, inverse_depth: np.ndarray) -> np.ndarray:
