@@ -31,10 +31,11 @@ class BulletRenderer:
     def __init__(self, client: int, plugin: int | None = None):
         if not p.isNumpyEnabled():
             raise DeskError(
-                "this pybullet was built without numpy, so its cameras return Python tuples and are many times "
-                "slower. Reinstall it with numpy present: `make install` in this package's checkout, or "
-                "`pip install numpy setuptools wheel && pip install --no-build-isolation --no-binary pybullet "
-                "--force-reinstall --no-cache-dir pybullet==3.2.7`"
+                "this pybullet was built without numpy, so its own cameras return Python tuples and are many times "
+                "slower. Renderers gl and tiny need no numpy there. Build it again for the other two, as "
+                "`make install` does in this package's checkout: `pip install 'numpy>=2.0,<2.3' 'setuptools<82' wheel "
+                "&& pip install --no-build-isolation --no-binary pybullet --force-reinstall --no-cache-dir "
+                "pybullet==3.2.7`"
             )
         self._client = client
         self._renderer = p.ER_TINY_RENDERER if plugin is None else p.ER_BULLET_HARDWARE_OPENGL

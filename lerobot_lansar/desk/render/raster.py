@@ -10,6 +10,7 @@ from numba import njit
 from .geometry import CLUSTER
 
 NOTHING = -1
+_WIDE = 8  # columns
 BLOCK = 8
 """Texels along each side of a block of the shadow map."""
 _VECTOR = {"contract", "arcp", "nsz"}  # what lets a compiler work on eight faces at once
@@ -140,6 +141,16 @@ def nearest(
 
 
 @njit(cache=True, error_model="numpy")
+def _narrowed(start, slope, first, last):  # type: ignore[no-untyped-def]
+    """The columns among `first` to `last` where start + slope * column can be positive."""
+    if slope > 0:
+        return max(first, int(np.ceil(min(-start / slope, 1e6))) - 1), last
+    if slope < 0:
+        return first, min(last, int(np.floor(max(-start / slope, -1e6))) + 1)
+    return first, last
+
+
+@njit(cache=True, error_model="numpy")
 def _fill(f, xa, ya, wa, xb, yb, wb, xc, yc, wc, x0, x1, y0, y1, rule, ranks, inverse_depth, ids):  # type: ignore[no-untyped-def]
     xa, ya, xb, yb, xc, yc = float(xa), float(ya), float(xb), float(yb), float(xc), float(yc)
     near, far, first_wins = rule
@@ -149,7 +160,12 @@ def _fill(f, xa, ya, wa, xb, yb, wb, xc, yc, wc, x0, x1, y0, y1, rule, ranks, in
         ea0, ea1 = xb * (yc - y) - xc * (yb - y), yb - yc
         eb0, eb1 = xc * (ya - y) - xa * (yc - y), yc - ya
         ec0, ec1 = xa * (yb - y) - xb * (ya - y), ya - yb
-        for x in range(x0, x1 + 1):
+        first, last = x0, x1
+        if x1 - x0 > _WIDE:  # look only at what may be inside, and a pixel more for rounding
+            first, last = _narrowed(ea0, ea1, first, last)
+            first, last = _narrowed(eb0, eb1, first, last)
+            first, last = _narrowed(ec0, ec1, first, last)
+        for x in range(first, last + 1):
             ea = ea0 + x * ea1
             eb = eb0 + x * eb1
             ec = ec0 + x * ec1

@@ -169,10 +169,12 @@ def shade_gl(
             red, green, blue = 1.0, 1.0, 1.0
             first, count = places[shape, 0], places[shape, 1]
             if count > 0:
-                u, v = _mixed(face, 18, 2, pa, pb, pc) / total, _mixed(face, 19, 2, pa, pb, pc) / total
-                level = _level(
-                    face, u, v, (pa, pb, pc), (a1, b1, c1), (a2, b2, c2), levels[first, 1], levels[first, 2], count
-                )
+                share = 1 / total
+                u, v = _mixed(face, 18, 2, pa, pb, pc) * share, _mixed(face, 19, 2, pa, pb, pc) * share
+                ux, vx = _slope(face, u, v, a1, b1, c1, share)
+                uy, vy = _slope(face, u, v, a2, b2, c2, share)
+                width, high = levels[first, 1], levels[first, 2]
+                level = _level(ux * width, vx * high, uy * width, vy * high, count)
                 red, green, blue = _sample(u, v, level, first, levels, texels)
             red, green, blue = red * colors[shape, 0], green * colors[shape, 1], blue * colors[shape, 2]
             light = 0.5 + 0.5 * toward
@@ -195,11 +197,11 @@ def _highlight(lamp, px, py, pz, nx, ny, nz):  # type: ignore[no-untyped-def]
     across = 2 * to_light * to_eye - (ax * bx + ay * by + az * bz)
     if across <= 0:
         return 0.0
-    squares = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz)
-    cosine = across / np.sqrt(squares)
-    c2 = cosine * cosine
+    c2 = across * across / ((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))
+    if c2 < 0.64:  # a highlight of less than 0.02 of 255
+        return 0.0
     c8 = c2 * c2 * c2 * c2
-    return 0.5 * c8 * c8 * c8 * c8 * c8 * cosine
+    return 0.5 * c8 * c8 * c8 * c8 * c8 * np.sqrt(c2)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
@@ -232,16 +234,21 @@ def _byte(value):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-def _level(face, u, v, weights, columns, rows, width, height, count):  # type: ignore[no-untyped-def]
-    """Mipmap level of a pixel: log2 of the longer axis of the ellipse of texels that it covers, as GPUs have it."""
-    qa, qb, qc = weights[0] + columns[0], weights[1] + columns[1], weights[2] + columns[2]
-    share = 1 / (qa + qb + qc)
-    ux = (_mixed(face, 18, 2, qa, qb, qc) * share - u) * width
-    vx = (_mixed(face, 19, 2, qa, qb, qc) * share - v) * height
-    qa, qb, qc = weights[0] + rows[0], weights[1] + rows[1], weights[2] + rows[2]
-    share = 1 / (qa + qb + qc)
-    uy = (_mixed(face, 18, 2, qa, qb, qc) * share - u) * width
-    vy = (_mixed(face, 19, 2, qa, qb, qc) * share - v) * height
+def _slope(face, u, v, a, b, c, share):  # type: ignore[no-untyped-def]
+    """What the texture coordinates u and v grow by per pixel, if the corners' weights grow by a, b and c; `share` is
+    1 / the weights' sum."""
+    sum_ = a + b + c
+    return (_mixed(face, 18, 2, a, b, c) - u * sum_) * share, (_mixed(face, 19, 2, a, b, c) - v * sum_) * share
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+def _level(ux, vx, uy, vy, count):  # type: ignore[no-untyped-def]
+    """Mipmap level of a pixel: log2 of the longer axis of the ellipse of texels that it covers, as GPUs have it.
+
+    Args:
+        ux, vx, uy, vy: Texels per column and per row of the picture.
+        count: How many levels there are.
+    """
     along, across, mixed = ux * ux + vx * vx, uy * uy + vy * vy, ux * uy + vx * vy
     square = 0.5 * (along + across + np.sqrt((along - across) ** 2 + 4 * mixed * mixed))
     # log2 of the mantissa, 0.5 to 1, by a cubic: at most 0.0014 off

@@ -99,6 +99,7 @@ class SoftwareRenderer:
         self._moving = [i for i, group in enumerate(stage.groups) if not group.still]
         # resting blocks tremble; resting joints stand still to the last bit
         self._jointed = [i for i in self._moving if stage.groups[i].jointed]
+        self._blanks: dict[int, np.ndarray] = {}
         self._backdrops: dict[tuple[int, bytes], tuple[Layer, Layer]] = {}
 
     def draw(
@@ -186,8 +187,9 @@ class SoftwareRenderer:
     def _blank(
         self, intrinsics: Intrinsics, projection: np.ndarray, size: int, poses: np.ndarray, colors: Colors
     ) -> Frame:
-        picture = np.empty((size, size, 3), np.uint8)
-        picture[:] = self.background
+        if size not in self._blanks:
+            self._blanks = {size: np.full((size, size, 3), self.background, np.uint8)}
+        picture = self._blanks[size].copy()
         return Frame(intrinsics, projection, poses, colors, picture, np.zeros((size, size), np.float32))
 
     def _intrinsic_matrix(self, intrinsics: Intrinsics, size: int) -> np.ndarray:
