@@ -41,7 +41,7 @@ class OpenGLLook(SoftwareRenderer):
                 levels += chain
         self._levels, self._texels = pack(levels)
         self._textures = np.array([ranges.get(id(image), (0, 0)) for image in images], np.int64)
-        cell = 0.4 / TEXELS_PER_METRE  # finer detail casts no shadow of its own
+        cell = 0.6 / TEXELS_PER_METRE  # finer detail casts no shadow of its own
         self._caster_clusters = Clusters([simplified(corners_of(group), cell) for group in stage.groups])
         self._shadow, extent = shadow_matrix()
         self._lamp = np.stack([LIGHT, HIGHLIGHT_EYE])

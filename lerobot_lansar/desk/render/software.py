@@ -6,6 +6,7 @@ picture or faces away, and draw what never moves once per fixed camera.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Frame:
         intrinsics: Field of view and clip planes.
         projection: (3, 4) world coordinates to homogeneous pixels (column * w, row * w, w).
         poses: (G, 4, 4) of the groups. colors: Rgba of repainted links, by (body, link).
-        world: (3, 4) homogeneous pixels (column * w, row * w, w) to world coordinates, m.
+        world: (3, 4) homogeneous pixels to world coordinates, m; its last column is where the camera is.
         picture: (size, size, 3) uint8. inverse_depth: (size, size) float32, 1 / w, row 0 at the bottom.
     """
 
@@ -42,13 +43,14 @@ class Frame:
     inverse_depth: np.ndarray
 
     def __post_init__(self) -> None:
-        back = np.linalg.inv(self.projection[:, :3])
-        self.world = np.column_stack([back, -back @ self.projection[:, 3]])
+        self.world = _world(self.projection.tobytes())
 
-    @property
-    def eye(self) -> np.ndarray:
-        """Where the camera is, (3,) m."""
-        return self.world[:, 3]
+
+@lru_cache(8)  # fixed cameras ask for the same one again and again
+def _world(projection: bytes) -> np.ndarray:
+    matrix = np.frombuffer(projection).reshape(3, 4)
+    back = np.linalg.inv(matrix[:, :3])
+    return np.column_stack([back, -back @ matrix[:, 3]])
 
 
 @dataclass
@@ -163,7 +165,7 @@ class SoftwareRenderer:
         raster.nearest(
             np.asarray(groups, np.int64),
             matrices,
-            ((frame.eye - frame.poses[:, :3, 3])[:, None] @ frame.poses[:, :3, :3])[:, 0],
+            ((frame.world[:, 3] - frame.poses[:, :3, 3])[:, None] @ frame.poses[:, :3, :3])[:, 0],
             geometry.spheres,
             geometry.ranges,
             geometry.cones,

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pybullet as p
@@ -77,15 +78,16 @@ class Stage:
         for body in self._free:
             pose = p.getBasePositionAndOrientation(body, physicsClientId=self._client)
             if pose != self._moment.get(body):
-                self._poses[self._rows[body][0]] = self._base(body)
+                self._poses[self._rows[body][0]] = self._base(body, pose)
                 self._moment[body] = pose
         return self._poses
 
     def _moves(self, body: int, link: int) -> bool:
         return body in self._free or (body in self._jointed and self._jointed[body].moves(link))
 
-    def _base(self, body: int) -> np.ndarray:
-        position, orientation = p.getBasePositionAndOrientation(body, physicsClientId=self._client)
+    def _base(self, body: int, pose: tuple[Any, Any] | None = None) -> np.ndarray:
+        """URDF frame of a body's base, (4, 4), from its Bullet pose."""
+        position, orientation = pose or p.getBasePositionAndOrientation(body, physicsClientId=self._client)
         _, _, _, local_position, local_orientation = self._inertial[body][:5]
         if any(local_position) or local_orientation != (0.0, 0.0, 0.0, 1.0):
             inverse = p.invertTransform(local_position, local_orientation)
