@@ -1,7 +1,8 @@
 """CALVIN's two cameras: what they see and where they are. Needs numpy only.
 
 Conventions are OpenCV's. A camera looks along its z axis; x points to the right in the picture and y down. The centre
-of the upper left pixel is (0, 0). Depth is the distance along z (m). A pose takes camera coordinates to the world's (m).
+of the upper left pixel is (0, 0). Depth is the distance along z (m). A pose takes a camera's coordinates to the world's
+(m).
 """
 
 from dataclasses import dataclass

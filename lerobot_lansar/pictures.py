@@ -8,6 +8,12 @@ MAX_SIZE = 256
 """Largest width and height that pictures may be brought to; CALVIN's own have 200 and 84 pixels."""
 
 
+def check_size(option: str, size: int, largest: int = MAX_SIZE) -> None:
+    """Raises ValueError unless an option's value is a size of pictures in pixels, or 0."""
+    if not 0 <= size <= largest:
+        raise ValueError(f"{option} must be between 1 and {largest} pixels, or 0 for the cameras' own, got {size}")
+
+
 def resize(pictures: np.ndarray, size: int) -> np.ndarray:
     """Square pictures of another size; the same bits on every machine.
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from ..calvin import block_columns
 from ..desk.scenes import Scene
+from ..pictures import resize
 
 FRAME = "episode_{:07d}.npz"
 STATES = ("robot_obs", "scene_obs")
@@ -65,24 +66,31 @@ class FrameWriter:
     """Writes one npz per frame into `folder`, which appears when the writer is closed without an error.
 
     Frames come with blocks in red, blue, pink order in `scene_obs`; files have them in CALVIN's order for the scene.
+
+    Args:
+        folder: The folder.
+        scene: Where the frames are from.
+        image_size: Width and height of all pictures and depth in the files; 0: as they come.
     """
 
-    def __init__(self, folder: Path, scene: Scene):
-        self._folder = folder
+    def __init__(self, folder: Path, scene: Scene, image_size: int = 0):
+        self._folder, self._image_size = folder, image_size
         self._partial = folder.with_name(f"{folder.name}-{_process()}.partial")
         self._columns = block_columns(tuple(scene.blocks))
         self._sums: dict[str, np.ndarray] = {}
         self.frames = 0
 
     def add(self, frame: dict[str, np.ndarray]) -> None:
-        """Writes the next frame: `robot_obs` (15,), `scene_obs` (24,), actions (7,) and pictures."""
+        """Writes the next frame: `robot_obs` (15,), `scene_obs` (24,), actions (7,), pictures and depth."""
+        pictures = [key for key in frame if key.startswith(("rgb_", "depth_"))]
         data = {**frame, "scene_obs": frame["scene_obs"][self._columns]}
+        if self._image_size:
+            data |= {key: resize(frame[key], self._image_size) for key in pictures}
         for key in STATES:
             sums = np.stack([data[key], data[key] ** 2])
             self._sums[key] = self._sums.get(key, 0.0) + sums
         # the quickest compression shrinks pictures to a third, and others hardly further
-        packed = any(key.startswith(("rgb_", "depth_")) for key in data)
-        kind = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
+        kind = zipfile.ZIP_DEFLATED if pictures else zipfile.ZIP_STORED
         with zipfile.ZipFile(self._partial / f"{self.frames:06d}.npz", "w", kind, compresslevel=1) as file:
             for key, value in data.items():
                 buffer = io.BytesIO()

@@ -125,8 +125,8 @@ def record_unit(config: RecordConfig, index: int) -> None:
     """Records one episode (the first accepted one of its attempts) or one session of play."""
     slot = config.slot(index)
     seed = [config.seed, SPLITS.index(slot.split), slot.number]
-    desk = _desk(slot.scene, config.assets, tuple(config.cameras), config.renderer)
-    with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene) as writer:
+    desk = _desk(slot.scene, config.assets, tuple(config.cameras), config.renderer, config.depth)
+    with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene, config.image_size) as writer:
         if config.mode != "windows":
             frames = config.session_frames(slot.split)[slot.number]
             rng, whole = np.random.default_rng(seed), config.mode == "chains"
@@ -158,9 +158,9 @@ def _attempt(config: RecordConfig, desk: Desk, task: str, seed: list[int]) -> tu
 
 
 @cache
-def _desk(scene: str, assets: str | None, cameras: tuple[str, ...], renderer: str) -> Desk:
+def _desk(scene: str, assets: str | None, cameras: tuple[str, ...], renderer: str, depth: bool) -> Desk:
     """One desk per scene and process: loading it takes as long as several episodes."""
-    return Desk(scene, assets, cameras, renderer)
+    return Desk(scene, assets, cameras, renderer, depth)
 
 
 def _note(config: RecordConfig, index: int) -> Path:

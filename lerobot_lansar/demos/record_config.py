@@ -9,6 +9,7 @@ from ..calvin import CONTROL_HZ
 from ..desk import SCENES, DeskError
 from ..jobs.executors import check_executor
 from ..jobs.work import SlurmConfig
+from ..pictures import check_size
 from .skills import SKILLS
 
 SPLITS = ("training", "validation")
@@ -64,6 +65,10 @@ class RecordConfig:
     seed: int = 0
     # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
     cameras: list[str] = field(default_factory=lambda: ["static", "gripper"])
+    # Record the cameras' depth too (m), as in CALVIN's public data.
+    depth: bool = False
+    # Width and height of both cameras' pictures and depth; 0: 200 and 84, the cameras' own.
+    image_size: int = 0
     # Disturbance of executed actions, in relative action units (the recorded actions are the intended ones).
     noise: float = 0.2
     # How much speed, approach, contact points and pauses differ between episodes: 0 (not at all) to 1.
@@ -102,6 +107,9 @@ class RecordConfig:
         if self.mode not in MODES:
             raise DeskError(f"--mode is one of {', '.join(MODES)}, got {self.mode!r}")
         check_executor(self.executor, self.slurm)
+        check_size("--image_size", self.image_size)
+        if self.depth and not self.cameras:
+            raise DeskError("--depth=true needs --cameras")
         if not 0 <= self.variety <= 1:
             raise DeskError(f"--variety lies between 0 and 1, got {self.variety}")
         if not 0 <= self.noise <= 0.5:

@@ -1,6 +1,7 @@
 """The CALVIN desk as a gymnasium environment, `lerobot_lansar/Calvin-v0`, and as LeRobot's `--env.type=calvin`.
 
 calvin                  `CalvinEnv`: chains of the benchmark or single tasks, rewards, ends of episodes
+pictures                pictures, depth and camera poses of its observations
 spaces                  its observation and action spaces
 control_mode            refuses an episode's first action if it plainly belongs to the other control mode
 episodes                `episodes.jsonl`: one line per finished episode, which the report reads

@@ -11,18 +11,23 @@ import gymnasium as gym
 import numpy as np
 
 from ..benchmark import LH_MTLC, load_chains
-from ..calvin import CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS, continuous_euler
+from ..calvin import CAMERAS, CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS, continuous_euler
 from ..desk import Desk, DeskError, Observation, SimulationError, Snapshot, is_fulfilled
 from ..desk.render import RENDERERS
 from ..desk.sentences import load_commands
 from ..desk.starts import sample_start
+from ..pictures import check_size
 from .control_mode import refuse_other_mode
 from .episodes import append_episode
+from .pictures import Pictures
 from .spaces import ACTION_SIZE, action_space, observation_space
 
 # With an episode's seed: generators apart from the one that draws its start.
 _PERTURBATION_STREAM = (4, 9)
 _SENTENCE_STREAM = (1,)
+
+LARGEST_RENDER = 1024
+"""Largest width and height of what `CalvinEnv.render` returns, pixels."""
 
 SENTENCE_CHOICES = ("first", "random")
 """Which of a task's sentences commands it."""
@@ -46,7 +51,10 @@ class CalvinEnv(gym.Env):
         this package: they do not jump where the arm works. `environment_state` (24,): CALVIN's scene_obs, blocks in
         red, blue, pink order; privileged simulator state (58 numbers with `task_in_state`). `pixels`: the pictures
         named by `cameras`, `static` (200, 200, 3) and `gripper` (84, 84, 3) uint8. `control_mode` (1,): 0 relative,
-        1 absolute; policies check it.
+        1 absolute; policies check it. With `depth`, `images.<camera>_depth` (1, n, n) float32: the distance along the
+        camera's axis, in the form in which LeRobot hands depth to policies. With `camera_poses`,
+        `camera_pose.<camera>` (16,) and `camera_intrinsics.<camera>` (9,) float32: the matrices (4, 4) and (3, 3) of
+        `Desk.camera`, row by row.
 
     Rewards: 1 for each fulfilled command, judged by CALVIN's oracle after every step; 0 otherwise. The return of a
         chain is the number of commands fulfilled in a row; its mean over chains is CALVIN's average length.
@@ -79,6 +87,12 @@ class CalvinEnv(gym.Env):
             5 and 0.5). The draws depend on the episode's seed.
         perturbation_scale: Gamma of that equation.
         render_fps: How many new pictures `render` draws per second; in between it returns the last one again.
+        depth: Whether observations hold the cameras' depth too.
+        depth_unit: `"m"` or `"mm"`.
+        camera_poses: Whether observations hold the cameras' poses and intrinsics too.
+        image_size: Width and height of all pictures and depth in observations; 0: the cameras' own. `resize` in
+            `lerobot_lansar.pictures` says how they are brought to that size.
+        render_size: Width and height of what `render` returns; 0: the camera's own.
         task_in_state: Whether `environment_state` also holds a number for each of the 34 tasks: 1 for the one that is
             commanded, 0 for the others. For policies that read no language (ACT, Diffusion, VQ-BeT), trained on
             what `lansar-convert --task_in_state=true` makes.
@@ -105,6 +119,11 @@ class CalvinEnv(gym.Env):
         perturbation_scale: float = 0.0,
         render_fps: int = CONTROL_HZ,
         task_in_state: bool = False,
+        depth: bool = False,
+        depth_unit: str = "m",
+        camera_poses: bool = False,
+        image_size: int = 0,
+        render_size: int = 0,
         render_mode: str | None = "rgb_array",
     ):
         _check_task(task, scene)
@@ -115,6 +134,8 @@ class CalvinEnv(gym.Env):
             raise DeskError(f"sentence {sentence!r} is unknown; it is 'first' or 'random'")
         if renderer not in RENDERERS:
             raise DeskError(f"renderer {renderer!r} is unknown; choose among {', '.join(RENDERERS)}")
+        check_size("render_size", render_size, LARGEST_RENDER)
+        self.pictures = Pictures(tuple(cameras), image_size, depth, depth_unit, camera_poses)
         self.task = task
         self.control_mode = control_mode
         self.sentence = sentence
@@ -122,15 +143,15 @@ class CalvinEnv(gym.Env):
         self.perturbation_every, self.perturbation_scale = perturbation_every, perturbation_scale
         self.task_in_state = task_in_state
         self.render_mode = render_mode
-        self.observation_space = observation_space(cameras, task_in_state)
+        self.observation_space = observation_space(self.pictures, task_in_state)
         self.action_space = action_space(control_mode)
-        self._cameras = tuple(cameras)
+        self._render_size = render_size or CAMERAS["static"]
         self._redraw_every = max(1, round(CONTROL_HZ / render_fps))
         self._results_dir = None if results_dir is None else Path(results_dir)
         self._sentences = load_commands(annotations, "validation")
         self._max_episode_steps = steps_per_command * (CHAIN_LENGTH if task == LH_MTLC else 1)  # LeRobot asks for it
         self.task_description = "" if task == LH_MTLC else self._sentences[task][0]
-        self._open_desk = functools.partial(Desk, scene, assets, cameras=self._cameras, renderer=renderer)
+        self._open_desk = functools.partial(Desk, scene, assets, self.pictures.cameras, renderer, depth)
         self._desk: Desk | None = None  # opened at the first reset, in the process that steps it
         self._commands: tuple[str, ...] = ()  # tasks of the episode; empty when none is under way
         self._outcomes: list[dict[str, Any]] = []  # of the commands that ended, in order
@@ -208,13 +229,13 @@ class CalvinEnv(gym.Env):
             )
 
     def render(self) -> np.ndarray:  # type: ignore[override]
-        """The static camera's picture, (200, 200, 3) uint8."""
+        """The static camera's picture, (200, 200, 3) uint8, or of `render_size`."""
         if self._desk is None:
             raise DeskError("reset the environment before rendering it")
         if self._reason is not None and self._picture is not None:
             return self._picture[1]
         if self._picture is None or self._steps - self._picture[0] >= self._redraw_every:
-            self._picture = (self._steps, self._desk.render("static"))
+            self._picture = (self._steps, self._desk.render("static", self._render_size))
         return self._picture[1]
 
     def close(self) -> None:
@@ -265,16 +286,14 @@ class CalvinEnv(gym.Env):
     def _observation(self) -> dict[str, Any]:
         state, robot = self._last["scene_obs"], self._last["robot_obs"].copy()
         robot[3:6] = continuous_euler(robot[3:6])
-        observation: dict[str, Any] = {
+        if "rgb_static" in self._last and self._render_size == CAMERAS["static"]:
+            self._picture = (self._steps, self._last["rgb_static"])
+        return {
             "agent_pos": robot,
             "environment_state": np.concatenate([state, self._task_one_hot]) if self.task_in_state else state,
             "control_mode": np.array([CONTROL_MODES.index(self.control_mode)], dtype=np.float32),
+            **self.pictures.observe(self._last),
         }
-        if self._cameras:
-            observation["pixels"] = {camera: self._last[f"rgb_{camera}"] for camera in self._cameras}
-        if "rgb_static" in self._last:
-            self._picture = (self._steps, self._last["rgb_static"])
-        return observation
 
     def _info(self) -> dict[str, Any]:
         successes = self._successes()
@@ -300,6 +319,7 @@ class CalvinEnv(gym.Env):
             "reason": self._reason,
             "assets": self._desk.assets,
             "renderer": self._desk.renderer if self._desk.cameras else None,
+            "image_size": self.pictures.image_size if self._desk.cameras else None,
             "control_mode": self.control_mode,
             "steps_per_command": self.steps_per_command,
             "sentence": self.sentence,

@@ -6,28 +6,40 @@ seen, except the policy's path.
 
 import json
 from pathlib import Path
+from typing import Any
 
-from lerobot.configs import PreTrainedConfig, parser
-from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE
+from huggingface_hub import hf_hub_download
+from lerobot.configs import DEFAULT_DEPTH_UNIT, PreTrainedConfig, parser
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES
 
+from ..calvin import CAMERAS
 from ..command import CommandError
+from .pictures import Pictures
 from .spaces import environment_state_size
 
 
-def refuse_recording() -> None:
-    """Refuses `--eval.recording=true` where sentences differ between episodes or change within one.
+def refuse_recording(mixed: bool, depth: bool) -> None:
+    """Refuses `--eval.recording=true` where LeRobot could not record what happens.
 
-    LeRobot would label all frames with the first environment's first sentence.
+    Args:
+        mixed: Sentences differ between episodes or change within one. LeRobot would label all frames with the first
+            environment's first sentence.
+        depth: Observations hold depth, which LeRobot would encode as colours.
 
     Raises:
         CommandError: The command records.
     """
-    if (parser.parse_arg("eval.recording") or "false").lower() != "false":
+    if (parser.parse_arg("eval.recording") or "false").lower() == "false":
+        return
+    if mixed:
         raise CommandError(
             "--eval.recording=true would label every frame with one sentence, the first environment's first, but "
             "chains and --env.sentence=random have several: record single tasks with --env.sentence=first, or use "
             "lansar-record for demonstrations"
         )
+    if depth:
+        raise CommandError("--eval.recording=true cannot store depth: leave out --env.depth, or use lansar-record")
 
 
 def check_environment_state(task_in_state: bool) -> None:
@@ -41,7 +53,7 @@ def check_environment_state(task_in_state: bool) -> None:
     Raises:
         CommandError: They differ by the task's 34 numbers.
     """
-    size, trained = environment_state_size(task_in_state), _trained_size()
+    size, trained = environment_state_size(task_in_state), _trained_shapes().get(OBS_ENV_STATE, (None,))[0]
     if trained == environment_state_size(not task_in_state):
         raise CommandError(
             f"the policy was trained on {trained} numbers of {OBS_ENV_STATE}, but the environment gives {size}: "
@@ -49,17 +61,62 @@ def check_environment_state(task_in_state: bool) -> None:
         )
 
 
-def _trained_size() -> int | None:
-    """How many numbers of the environment state the command's policy reads; None if none, or if that is unknown.
+def check_pictures(pictures: Pictures) -> None:
+    """Compares the environment's pictures with those that the command's policy was trained on.
 
-    Known for `--policy.path`, and for a dataset on this machine that a new policy is trained on.
+    A policy that reads depth would end with a KeyError without; one that gets pictures of another size does not end,
+    but fails at its tasks.
+
+    Raises:
+        CommandError: They have another size, or the policy reads depth and there is none.
+    """
+    trained = _trained_shapes()
+    for camera in pictures.cameras:
+        key, size = f"{OBS_IMAGES}.{camera}", pictures.size(camera)
+        if f"{key}_depth" in trained and not pictures.depth:
+            raise CommandError(f"the policy was trained on {key}_depth: set --env.depth=true")
+        if key in trained and trained[key][1] != size:
+            own = 0 if trained[key][1] == CAMERAS[camera] else trained[key][1]
+            raise CommandError(
+                f"the policy was trained on pictures of {trained[key][1]} pixels in {key}, but the environment's have "
+                f"{size}: set --env.image_size={own}"
+            )
+
+
+def trained_depth_unit() -> str:
+    """The unit in which LeRobot gives depth to the command's policy in training, `"m"` or `"mm"`.
+
+    A training command's own `--dataset.depth_output_unit`, or that of the training that made `--policy.path`.
+    """
+    policy, option = parser.get_path_arg("policy"), "depth_output_unit"
+    if parser.parse_arg("dataset.repo_id") is not None or policy is None:
+        return parser.parse_arg(f"dataset.{option}") or DEFAULT_DEPTH_UNIT
+    return _training_of(policy).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
+
+
+def _training_of(policy: str) -> dict[str, Any]:
+    """The options with which LeRobot trained a policy, from the file that it keeps beside it; empty without one."""
+    file = Path(policy, TRAIN_CONFIG_NAME)
+    if not Path(policy).is_dir():
+        try:
+            file = Path(hf_hub_download(policy, TRAIN_CONFIG_NAME))
+        except (OSError, ValueError):  # no such file there, or no hub
+            return {}
+    return json.loads(file.read_text()) if file.is_file() else {}
+
+
+def _trained_shapes() -> dict[str, tuple[int, ...]]:
+    """The shapes of what the command's policy reads, by key; empty if that is unknown.
+
+    Known for `--policy.path`, and for a dataset on this machine that a new policy is trained on. The second number of
+    a picture's shape is its height in both.
     """
     policy, dataset = parser.get_path_arg("policy"), parser.parse_arg("dataset.repo_id")
     if policy is not None:
-        feature = (PreTrainedConfig.from_pretrained(policy).input_features or {}).get(OBS_ENV_STATE)
-        return None if feature is None else feature.shape[0]
-    if dataset is not None:
-        file = Path(parser.parse_arg("dataset.root") or HF_LEROBOT_HOME / dataset, "meta", "info.json")
-        features = json.loads(file.read_text())["features"] if file.is_file() else {}
-        return features[OBS_ENV_STATE]["shape"][0] if OBS_ENV_STATE in features else None
-    return None
+        features = PreTrainedConfig.from_pretrained(policy).input_features or {}
+        return {key: tuple(feature.shape) for key, feature in features.items()}
+    if dataset is None:
+        return {}
+    file = Path(parser.parse_arg("dataset.root") or HF_LEROBOT_HOME / dataset, "meta", "info.json")
+    features = json.loads(file.read_text())["features"] if file.is_file() else {}
+    return {key: tuple(feature["shape"]) for key, feature in features.items()}

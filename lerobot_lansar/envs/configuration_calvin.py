@@ -4,18 +4,21 @@ import functools
 from dataclasses import dataclass, field
 
 import gymnasium as gym
+from lerobot.configs import DEFAULT_DEPTH_UNIT
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, OBS_STR
 
 from ..benchmark import LH_MTLC
 from ..calvin import CAMERAS, CONTROL_HZ, ROBOT_OBS_NAMES, STEPS_PER_COMMAND
 from ..command import CommandError
 from ..desk import Desk
 from ..desk.render import OURS
-from .calvin import CalvinEnv
-from .command_line import check_environment_state, refuse_recording
+from ..pictures import check_size
+from .calvin import LARGEST_RENDER, CalvinEnv
+from .command_line import check_environment_state, check_pictures, refuse_recording, trained_depth_unit
+from .pictures import Pictures, camera_keys, depth_key
 from .spaces import ACTION_SIZE, environment_state_size
 from .suites import suites
 from .vector import ForkedVectorEnv, SerialVectorEnv
@@ -64,6 +67,17 @@ class CalvinEnvConfig(EnvConfig):
     # Add 34 numbers to environment_state, 1 for the commanded task and 0 for the others: for policies that read no
     # language, trained on what lansar-convert --task_in_state=true makes.
     task_in_state: bool = False
+    # Add the cameras' depth: observation.images.static_depth and .gripper_depth, one channel each.
+    depth: bool = False
+    # Unit of depth, mm or m; by default that in which LeRobot trained the policy: --dataset.depth_output_unit, or mm.
+    depth_unit: str | None = None
+    # Add the cameras' poses and intrinsics: observation.camera_pose.static (4x4 numbers, row by row),
+    # observation.camera_intrinsics.static (3x3), and the same for the gripper.
+    camera_poses: bool = False
+    # Width and height of both cameras' pictures, as in lansar-convert --image_size; 0: 200 and 84, the cameras' own.
+    image_size: int = 0
+    # Width and height of the pictures in LeRobot's videos; 0: 200, the static camera's own.
+    render_size: int = 0
 
     def __post_init__(self) -> None:
         if self.max_parallel_tasks != 1:
@@ -86,9 +100,31 @@ class CalvinEnvConfig(EnvConfig):
         for camera in self.cameras:
             if camera not in CAMERAS:
                 raise CommandError(f"--env.cameras: {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
-            size, key = CAMERAS[camera], f"{OBS_IMAGES}.{camera}"
-            self.features[key] = PolicyFeature(FeatureType.VISUAL, (size, size, 3))
-            self.features_map[key] = key
+        try:
+            self._pictures()
+            check_size("render_size", self.render_size, LARGEST_RENDER)
+        except ValueError as error:
+            raise CommandError(f"--env.{error}") from error
+        for camera in self.cameras:
+            self._describe(camera)
+
+    def _pictures(self) -> Pictures:
+        unit = self.depth_unit or DEFAULT_DEPTH_UNIT
+        return Pictures(tuple(self.cameras), self.image_size, self.depth, unit, self.camera_poses)
+
+    def _describe(self, camera: str) -> None:
+        """Describes what the observation holds of a camera."""
+        size, key = self._pictures().size(camera), f"{OBS_IMAGES}.{camera}"
+        self._add(key, key, FeatureType.VISUAL, (size, size, 3))
+        if self.depth:
+            self._add(depth_key(camera), f"{key}_depth", FeatureType.VISUAL, (size, size, 1))
+        for key, count in camera_keys(camera).items() if self.camera_poses else ():
+            self._add(key, f"{OBS_STR}.{key}", FeatureType.STATE, (count,))
+
+    def _add(self, key: str, policy_key: str, kind: FeatureType, shape: tuple[int, ...]) -> None:
+        """Describes an entry of the observation, by its own name and the one that LeRobot gives it."""
+        self.features[key] = PolicyFeature(kind, shape)
+        self.features_map[key] = policy_key
 
     @property
     def gym_id(self) -> str:
@@ -112,19 +148,25 @@ class CalvinEnvConfig(EnvConfig):
             "perturbation_scale",
             "render_fps",
             "task_in_state",
+            "depth",
+            "camera_poses",
+            "image_size",
+            "render_size",
         )
-        return {name: getattr(self, name) for name in names}
+        unit = self.depth_unit or (trained_depth_unit() if self.depth else DEFAULT_DEPTH_UNIT)
+        return {**{name: getattr(self, name) for name in names}, "depth_unit": unit}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Processors that change nothing. LeRobot asks for them before the first step, in training too.
 
         Raises:
-            CommandError: The command's policy was trained with another `environment_state`: `--env.task_in_state` was
-                forgotten, or is too much. Or the command records episodes whose sentences LeRobot would mix up.
+            CommandError: The command's policy was trained with another `environment_state`, without or with
+                `--env.task_in_state`, or on pictures of another size, or on depth. Or the command records what LeRobot
+                would mix up or cannot store.
         """
-        if self.sentence == "random" or LH_MTLC in self._suites():
-            refuse_recording()
+        refuse_recording(mixed=self.sentence == "random" or LH_MTLC in self._suites(), depth=self.depth)
         check_environment_state(self.task_in_state)
+        check_pictures(self._pictures())
         return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[])
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:

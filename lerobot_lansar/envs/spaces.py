@@ -1,12 +1,10 @@
 """Observation and action spaces of `CalvinEnv`."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from gymnasium import spaces
 
-from ..calvin import ACTION_NAMES, CAMERAS, HOME_EULER, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
-from ..desk import DeskError
+from ..calvin import ACTION_NAMES, HOME_EULER, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
+from .pictures import Pictures
 
 ACTION_SIZE = len(ACTION_NAMES["rel"])
 
@@ -22,23 +20,14 @@ def environment_state_size(task_in_state: bool) -> int:
     return len(SCENE_OBS_NAMES) + (len(TASKS) if task_in_state else 0)
 
 
-def observation_space(cameras: Sequence[str], task_in_state: bool) -> spaces.Dict:
-    """The space of the observations that `CalvinEnv` describes.
-
-    Raises:
-        DeskError: A camera is unknown.
-    """
+def observation_space(pictures: Pictures, task_in_state: bool) -> spaces.Dict:
+    """The space of the observations that `CalvinEnv` describes."""
     sizes = {"agent_pos": len(ROBOT_OBS_NAMES), "environment_state": environment_state_size(task_in_state)}
     entries: dict[str, spaces.Space] = {
         key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in sizes.items()
     }
     entries["control_mode"] = spaces.Box(0, 1, (1,), np.float32)
-    for camera in cameras:
-        if camera not in CAMERAS:
-            raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
-    if cameras:
-        entries["pixels"] = spaces.Dict({c: spaces.Box(0, 255, (CAMERAS[c], CAMERAS[c], 3), np.uint8) for c in cameras})
-    return spaces.Dict(entries)
+    return spaces.Dict({**entries, **pictures.spaces()})
 
 
 def action_space(control_mode: str) -> spaces.Box:

@@ -12,13 +12,14 @@ import pytest
 import yaml
 
 import lerobot_lansar.demos.record as record_module
-from lerobot_lansar.calvin import DRAWER, relative_action
+from lerobot_lansar.calvin import CAMERAS, DRAWER, relative_action
 from lerobot_lansar.demos.record import RecordConfig, record
 from lerobot_lansar.demos.record_config import SPLITS, group_by_scene
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, DeskError
 from lerobot_lansar.desk.sentences import COMMANDS
 from lerobot_lansar.jobs.work import SlurmConfig, WorkerDied
+from lerobot_lansar.pictures import resize
 
 
 def options(output_dir, **changes):
@@ -167,6 +168,27 @@ def first_file(folder, pattern, seconds=120):
             return file
         time.sleep(0.005)
     raise TimeoutError(f"no {pattern} in {folder} within {seconds} s")
+
+
+def test_depth_and_size_are_recorded_when_asked(tmp_path):
+    one_task = {"tasks": ["turn_on_led"], "episodes": 1, "validation_episodes": 1, "depth": True}
+    own = record(options(tmp_path / "own", cameras=["static", "gripper"], **one_task))
+    small = record(options(tmp_path / "small", cameras=["static", "gripper"], image_size=64, **one_task))
+    look = yaml.safe_load((small / "training" / ".hydra" / "merged_config.yaml").read_text())
+    assert {key: look[key] for key in ("renderer", "assets_used", "image_size", "depth")} == {
+        "renderer": "gl",
+        "assets_used": "built-in",
+        "image_size": 64,
+        "depth": True,
+    }
+    file = "training/episode_0000003.npz"
+    with np.load(own / file) as frame, np.load(small / file) as shrunk:
+        for camera, size in CAMERAS.items():
+            assert frame[f"depth_{camera}"].dtype == shrunk[f"depth_{camera}"].dtype == np.float32
+            assert frame[f"depth_{camera}"].shape == (size, size)
+            for key in (f"rgb_{camera}", f"depth_{camera}"):
+                np.testing.assert_array_equal(shrunk[key], resize(frame[key], 64))
+        np.testing.assert_array_equal(frame["robot_obs"], shrunk["robot_obs"])
 
 
 def test_a_killed_recording_leaves_no_split_and_goes_on(recording, tmp_path):
@@ -379,6 +401,8 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
         ({"scene": "E"}, "--scene: 'E' is none of A, B, C, D"),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"cameras": ["wrist"]}, "camera 'wrist'"),
+        ({"image_size": 300}, "--image_size must be between 1 and 256"),
+        ({"depth": True}, "--depth=true needs --cameras"),
         ({"assets": "nowhere"}, "is missing"),
     ],
 )

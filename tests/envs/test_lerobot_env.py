@@ -51,7 +51,7 @@ def test_every_option_of_the_desk_is_explained_by_help():
     own = {field.name for field in fields(CalvinEnvConfig)} - inherited | {"task", "fps"}
     explained = {name for name in own if get_attribute_docstring(CalvinEnvConfig, name).comment_above}
     assert explained == own
-    assert len(own) == 15
+    assert len(own) == 20
     text = io.StringIO()
     with pytest.raises(SystemExit), redirect_stdout(text):
         draccus.parse(CalvinEnvConfig, args=["--help"])
