@@ -169,7 +169,7 @@ class Session:
         if output is None:
             return
         if self.kept:
-            details = {key: str(value) for key, value in asdict(self.config).items()}
+            details: dict[str, str | int] = {key: str(value) for key, value in asdict(self.config).items()}
             details |= {"assets_used": self.desk.assets, "control_hz": CONTROL_HZ}
             publish_split(output / "training", self.kept, 0, details, {})
             print(f"{len(self.kept)} demonstrations in {output}")
