@@ -10,7 +10,8 @@ from typing import Any
 import draccus
 
 from ..benchmark import EPISODES_FILE, load_chains
-from ..command import CommandError, run_command
+from ..command import run_command
+from .policy import Policy, differences
 from .results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
 
 
@@ -27,7 +28,7 @@ class ReportConfig:
     # --seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000
     seed: int | None = None
     # --policy.path of that run, a folder or a name on the hub; the report then states whether the policy reads the
-    # simulator's own state
+    # simulator's own state, and whether it was evaluated in the look of its dataset
     policy_path: str | None = None
 
 
@@ -52,7 +53,9 @@ def report(config: ReportConfig) -> dict[str, Any]:
     if config.results_dir and not lines:
         raise FileNotFoundError(f"--results_dir={results_dir} holds no {EPISODES_FILE}")
     summary = summarise(collect(entries, lines, config.seed))
-    summary["policy_reads_scene_state"] = _reads_scene_state(config.policy_path)
+    policy = None if config.policy_path is None else Policy(config.policy_path)
+    summary["policy_reads_scene_state"] = None if policy is None else policy.reads_scene_state
+    summary["trained_look"] = None if policy is None else policy.trained_look()
     summary["notes"] = _notes(summary, chains_known=config.seed is not None or bool(lines))
     summary["lerobot_policy_lansar"] = version("lerobot_policy_lansar")
 
@@ -68,32 +71,6 @@ def report(config: ReportConfig) -> dict[str, Any]:
     return summary
 
 
-def _reads_scene_state(policy_path: str | None) -> bool | None:
-    """Whether the policy's inputs include the simulator's own state; None without a policy."""
-    if policy_path is None:
-        return None
-    policy = json.loads(_policy_config(policy_path).read_text())
-    # LanSAR may ignore the scene state although its inputs include it.
-    is_used = policy.get("use_spatial_context", True)
-    return is_used and "observation.environment_state" in (policy.get("input_features") or {})
-
-
-def _policy_config(policy_path: str) -> Path:
-    """A policy's `config.json`: in a folder, or else downloaded from the hub."""
-    file = Path(policy_path) / "config.json"
-    if file.is_file():
-        return file
-    from huggingface_hub import hf_hub_download  # late: most reports need no hub
-
-    try:
-        return Path(hf_hub_download(policy_path, "config.json"))
-    except (OSError, ValueError) as error:
-        raise CommandError(
-            f"--policy_path={policy_path} is neither a pretrained_model folder with a config.json nor a policy that "
-            f"the hub returns: {error}"
-        ) from error
-
-
 def _notes(summary: dict[str, Any], chains_known: bool) -> list[str]:
     """What a reader must know; without `chains_known`, the chains follow from LeRobot's default seed."""
     notes = []
@@ -105,6 +82,9 @@ def _notes(summary: dict[str, Any], chains_known: bool) -> list[str]:
         notes.append("The policy reads the simulator's own scene state (privileged), which a real robot does not have.")
     elif summary["policy_reads_scene_state"] is None:
         notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
+    other_look = differences(summary["trained_look"] or {}, summary["settings"])
+    if other_look is not None:
+        notes.append(f"The policy was trained on pictures of another look than it was evaluated on: {other_look}.")
     if summary["ended_early"]:
         notes.append(
             f"{summary['ended_early']} episodes failed because the desk refused an action or the simulation diverged: "

@@ -21,6 +21,7 @@ SETTINGS = (
     "scene",
     "assets",
     "renderer",
+    "image_size",
     "control_mode",
     "steps_per_command",
     "sentence",

@@ -204,6 +204,44 @@ def test_the_policy_may_be_one_on_the_hub(tmp_path, monkeypatch):
             report(config)
 
 
+def trained_on(folder, look, *features):
+    """A policy that reads these features, and its dataset with this look in its manifest."""
+    manifest = folder / "data" / "meta" / "calvin_source.json"
+    manifest.parent.mkdir(parents=True)
+    manifest.write_text(json.dumps({"request": {}, **({} if look is None else {"look": look})}))
+    (folder / "config.json").write_text(json.dumps({"input_features": {key: {} for key in features}}))
+    options = {"dataset": {"repo_id": "you/desk", "root": str(manifest.parents[1]), "revision": None}}
+    (folder / "train_config.json").write_text(json.dumps(options))
+    return str(folder)
+
+
+PUBLIC = {"renderer": "gl", "assets": "original", "image_size": None}
+
+
+@pytest.mark.parametrize(
+    ("look", "features", "settings", "note"),
+    [
+        (PUBLIC, ["static"], {"renderer": "gl", "assets": "original", "image_size": 0}, None),
+        (PUBLIC, ["static"], {"renderer": "pybullet_gl", "assets": "original", "image_size": 0}, None),
+        (PUBLIC, ["static"], {"renderer": "tiny", "assets": "original"}, "renderer gl (evaluated: tiny)"),
+        (PUBLIC, ["static"], {"renderer": "gl"}, "assets original (evaluated: built-in)"),
+        (PUBLIC, ["static"], {"renderer": None, "assets": "original", "image_size": None}, None),
+        ({**PUBLIC, "image_size": 128}, ["static"], {"assets": "original", "image_size": 0}, "image_size 128"),
+        (PUBLIC, ["static"], {"assets": "original", "image_size": 128}, "image_size 0 (evaluated: 128)"),
+        ({"assets": "original"}, ["static"], {"renderer": "tiny", "assets": "original", "image_size": 64}, None),
+        (PUBLIC, [], {"renderer": "tiny"}, None),
+        (None, ["static"], {"renderer": "tiny"}, None),
+    ],
+)
+def test_another_look_than_the_datasets_is_noticed(tmp_path, look, features, settings, note):
+    policy = trained_on(tmp_path / "policy", look, *(f"observation.images.{name}" for name in features))
+    folder = write_eval(tmp_path / "eval", ("calvin", [0.0]))
+    write_lines(folder, [(1000, 0, [("open_drawer", False)])], **settings)
+    notes = [note for note in report(ReportConfig(folder, policy_path=policy))["notes"] if "another look" in note]
+    assert len(notes) == (note is not None)
+    assert note is None or note in notes[0]
+
+
 def test_only_original_assets_are_called_comparable(tmp_path):
     folder = write_eval(tmp_path, ("calvin", [0.0]))
     assert any("not comparable" in note for note in report(ReportConfig(folder))["notes"])

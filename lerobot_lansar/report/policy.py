@@ -1,0 +1,100 @@
+"""What the files beside a policy say: its inputs, and the look of the pictures that it was trained on."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from ..command import CommandError
+
+MANIFEST = "meta/calvin_source.json"
+"""The file in which `lansar-convert` says where a dataset's pictures come from."""
+
+LOOK = ("renderer", "assets", "image_size")
+"""What decides how the desk looks in a policy's pictures; entries of an episode's line and of a manifest's `look`."""
+
+
+class Policy:
+    """A policy in a folder or on the hub.
+
+    Args:
+        path: `--policy.path` of its evaluation.
+
+    Raises:
+        CommandError: There is no policy.
+    """
+
+    def __init__(self, path: str):
+        try:
+            file = _file(path, "config.json")
+        except (OSError, ValueError) as error:
+            raise CommandError(
+                f"--policy_path={path} is neither a pretrained_model folder with a config.json nor a policy that "
+                f"the hub returns: {error}"
+            ) from error
+        self._path = path
+        self._config = json.loads(file.read_text())
+        self._inputs = self._config.get("input_features") or {}
+
+    @property
+    def reads_scene_state(self) -> bool:
+        """Whether it reads the simulator's own state."""
+        # LanSAR may ignore the scene state although its inputs include it.
+        return self._config.get("use_spatial_context", True) and "observation.environment_state" in self._inputs
+
+    def trained_look(self) -> dict[str, Any] | None:
+        """What is known of `LOOK` for the pictures that it was trained on; None if it reads none or nothing is known.
+
+        Its training's options, beside it, name the dataset, whose manifest names the look.
+        """
+        if not any(key.startswith("observation.image") for key in self._inputs):
+            return None
+        try:
+            dataset = json.loads(_file(self._path, "train_config.json").read_text())["dataset"]
+            look = json.loads(_manifest(dataset).read_text())["look"]
+        except (OSError, ValueError, KeyError):
+            return None
+        known = {key: look[key] for key in LOOK if look.get(key) is not None}
+        return {"image_size": 0, **known} if "image_size" in look else known  # 0 or none: the cameras' own
+
+
+def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None:
+    """How the look of an evaluation differs from that of a training, in words; None if it does not.
+
+    Args:
+        trained: What `Policy.trained_look` returned.
+        settings: The evaluation's, as `summarise` returns them. What either lacks is not compared.
+    """
+    found = []
+    for key, wanted in trained.items():
+        values = settings.get(key)
+        seen = values if isinstance(values, list) else [] if values is None else [values]
+        others = [str(value) for value in seen if _same_look(value) != _same_look(wanted)]
+        if others:
+            found.append(f"{key} {wanted} (evaluated: {', '.join(others)})")
+    return ", ".join(found) or None
+
+
+def _same_look(value: Any) -> Any:
+    """Our renderers and PyBullet's of the same name have one look."""
+    return value.removeprefix("pybullet_") if isinstance(value, str) else value
+
+
+def _manifest(dataset: dict[str, Any]) -> Path:
+    """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
+    cache = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "lerobot"
+    root = dataset.get("root") or Path(os.environ.get("HF_LEROBOT_HOME", cache)) / dataset["repo_id"]
+    file = Path(root).expanduser() / MANIFEST
+    return file if file.is_file() else _download(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
+
+
+def _file(path: str, name: str) -> Path:
+    """A policy's file: in a folder, or else downloaded from the hub."""
+    file = Path(path) / name
+    return file if file.is_file() else _download(path, name)
+
+
+def _download(repo_id: str, name: str, kind: str = "model", revision: str | None = None) -> Path:
+    from huggingface_hub import hf_hub_download  # late: most reports need no hub
+
+    return Path(hf_hub_download(repo_id, name, repo_type=kind, revision=revision))
