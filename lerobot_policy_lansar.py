@@ -1,4 +1,5 @@
-"""What LeRobot imports when it looks for plugins: registers policy `lansar` and environment `calvin` with it."""
+"""What LeRobot imports when it looks for plugins: registers policies and environment with it."""
 
+import lerobot_lansar.act_depth
 import lerobot_lansar.envs.configuration_calvin
 import lerobot_lansar.policy  # noqa: F401

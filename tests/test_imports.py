@@ -20,7 +20,13 @@ FLOORS = [
         "lerobot_lansar.paths",
     ),
     ("lerobot_lansar.clip",),
-    ("lerobot_lansar.desk", "lerobot_lansar.policy", "lerobot_lansar.report", "dataset_convert"),
+    (
+        "lerobot_lansar.desk",
+        "lerobot_lansar.policy",
+        "lerobot_lansar.act_depth",
+        "lerobot_lansar.report",
+        "dataset_convert",
+    ),
     ("lerobot_lansar.demos", "lerobot_lansar.envs"),
     (
         "lerobot_lansar.attention",
