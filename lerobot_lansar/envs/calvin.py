@@ -51,7 +51,7 @@ class CalvinEnv(gym.Env):
         this package: they do not jump where the arm works. `environment_state` (24,): CALVIN's scene_obs, blocks in
         red, blue, pink order; privileged simulator state (58 numbers with `task_in_state`). `pixels`: the pictures
         named by `cameras`, `static` (200, 200, 3) and `gripper` (84, 84, 3) uint8. `control_mode` (1,): 0 relative,
-        1 absolute; policies check it. With `depth`, `images.<camera>_depth` (1, n, n) float32: the distance along the
+        1 absolute. With `depth`, `images.<camera>_depth` (1, n, n) float32: the distance along the
         camera's axis, in the form in which LeRobot hands depth to policies. With `camera_poses`,
         `camera_pose.<camera>` (16,) and `camera_intrinsics.<camera>` (9,) float32: the matrices (4, 4) and (3, 3) of
         `Desk.camera`, row by row.
@@ -195,7 +195,7 @@ class CalvinEnv(gym.Env):
         """
         if self._desk is None or not self._commands:
             raise DeskError("reset the environment before stepping it")
-        if self._steps == 0 and _is_action(action):
+        if self._steps == 0 and _is_action(action):  # a wild action fails its own episode instead, in `_advance`
             refuse_other_mode(np.asarray(action, dtype=np.float64), self.control_mode)
         if self.perturbation_every and (self._steps + 1) % self.perturbation_every == 0:
             action = self._perturbed(np.array(action, dtype=np.float64))

@@ -148,6 +148,26 @@ def test_a_badly_trained_policys_relative_action_is_not_taken_for_an_absolute_on
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("mode", "action"),
+    [
+        ("abs", [150, 0, 0.4, 0.3, 0, 0, 1]),
+        ("abs", [5000, 0, -90, 0.9, 0, 0, 1]),
+        ("abs", [np.nan, 0, 0.4, 0.3, 0, 0, 1]),
+        ("rel", [0, 0, 0.4, 400, 0, 0, 1]),  # that roll points the hand down, after 64 turns
+    ],
+)
+def test_a_wild_first_action_fails_its_episode_and_does_not_stop_the_run(tmp_path, mode, action):
+    env = CalvinEnv("turn_on_led", cameras=(), control_mode=mode, results_dir=str(tmp_path))
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="episodes fail early"):
+        terminated = env.step(np.array(action))[2]
+    env.close()
+    assert terminated
+    (line,) = map(json.loads, (tmp_path / EPISODES_FILE).read_text().splitlines())
+    assert re.search(r"must be finite|within \+-100", line["reason"])
+
+
 @pytest.mark.parametrize(("value", "reason"), [(np.nan, "must be finite"), (1000.0, r"within \+-100")])
 @pytest.mark.parametrize("mode", ["rel", "abs"])
 def test_a_wild_action_fails_its_episode_and_says_why(tmp_path, mode, value, reason):
