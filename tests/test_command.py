@@ -1,17 +1,63 @@
-"""All `lansar-…` commands report errors in the same way and end with the same exit codes."""
+"""All `lansar-…` commands explain their options, report errors in the same way and end with the same exit codes."""
 
 import importlib
 import subprocess
 import sys
+from dataclasses import is_dataclass
 from importlib.metadata import entry_points
 
 import pytest
 from draccus.utils import ParsingError
+from draccus.wrappers import docstring
 
+from dataset_convert.embed import EmbedConfig
+from dataset_convert.options import ConvertConfig
+from dataset_convert.verify import VerifyConfig
+from lerobot_lansar.attention import AttentionConfig
 from lerobot_lansar.command import CommandError, run_command
+from lerobot_lansar.demos.record_config import RecordConfig
+from lerobot_lansar.demos.teleop import TeleopConfig
+from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.jobs.work import WorkerDied
+from lerobot_lansar.policy.configuration_lansar import LanSARConfig
+from lerobot_lansar.policy.scheduler import LinearWarmupDecaySchedulerConfig
+from lerobot_lansar.replay.replay import ReplayConfig
+from lerobot_lansar.report.report import ReportConfig
 
 COMMANDS = sorted(e.name for e in entry_points(group="console_scripts") if e.name.startswith("lansar-"))
+
+OPTIONS = [
+    RecordConfig,
+    TeleopConfig,
+    ConvertConfig,
+    EmbedConfig,
+    VerifyConfig,
+    ReplayConfig,
+    ReportConfig,
+    AttentionConfig,
+    CalvinEnvConfig,
+    LanSARConfig,
+    LinearWarmupDecaySchedulerConfig,
+]
+"""Options of all commands, and what LeRobot's commands take of ours."""
+
+
+def own_options(options):
+    """Class and name of every option that is ours, also in groups of options."""
+    for name, kind in options.__annotations__.items():
+        yield options, name
+        if is_dataclass(kind) and not kind.__module__.startswith("lerobot."):
+            yield from own_options(kind)
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_every_option_is_explained_by_help(options):
+    """draccus takes the text from the comment above the field; argparse would trip over a percent sign in it."""
+    for group, name in own_options(options):
+        text = docstring.get_preferred_help_text(docstring.get_attribute_docstring(group, name))
+        assert text, name
+        assert text.endswith("."), name
+        assert "%" not in text, name
 
 
 @pytest.mark.parametrize(("returned", "code"), [(None, 0), (0, 0), (1, 1)])

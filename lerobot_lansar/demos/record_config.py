@@ -45,6 +45,7 @@ class UnitSlot(NamedTuple):
 class RecordConfig:
     """Records demonstrations into OUTPUT_DIR/training and OUTPUT_DIR/validation, in CALVIN's on-disk format."""
 
+    # Folder to create; an interrupted recording goes on in it.
     output_dir: Path
     # One scene, or several among which the recording is divided evenly: --scene='[A,B,C]'.
     scene: list[str] | str = "D"
@@ -53,15 +54,18 @@ class RecordConfig:
     mode: str = "windows"
     # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
     tasks: list[str] = field(default_factory=lambda: list(SKILLS))
-    # Accepted demonstrations in the training split, and in the validation split (a tenth by default, and at least one
-    # of each task in each scene). Windows only.
+    # Accepted demonstrations in the training split. Windows only.
     episodes: int = 100
+    # Accepted demonstrations in the validation split; by default a tenth, and at least one of each task in each scene.
+    # Windows only.
     validation_episodes: int | None = None
-    # Hours of play or chains in the training split, and in the validation split (a tenth by default).
+    # Hours of play or chains in the training split.
     hours: float = 1.0
+    # Hours of play or chains in the validation split; a tenth by default.
     validation_hours: float | None = None
     # Length of a session of play or chains; sessions are divided among the workers.
     session_minutes: float = 2.0
+    # Decides all random choices: the same seed gives the same data for any number of workers.
     seed: int = 0
     # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
     cameras: list[str] = field(default_factory=lambda: ["static", "gripper"])
@@ -77,12 +81,15 @@ class RecordConfig:
     assets: str | None = None
     # What draws the pictures: gl (the look of CALVIN's public data), tiny, pybullet_gl or pybullet_tiny.
     renderer: str = "gl"
-    # YAML of sentences by task for each split; our own by default.
+    # YAML file of sentences by task for the training split, in CALVIN's format; our own by default.
     annotations: str | None = None
+    # The same for the validation split.
     validation_annotations: str | None = None
     # Where the work runs: local (processes), slurm or ray (pip install 'lerobot_policy_lansar[ray]').
     executor: str = "local"
+    # Processes that record in parallel; under Slurm, jobs at a time.
     workers: int = 1
+    # How jobs are submitted with --executor=slurm.
     slurm: SlurmConfig = field(default_factory=SlurmConfig)
 
     def __post_init__(self) -> None:

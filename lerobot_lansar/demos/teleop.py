@@ -59,13 +59,15 @@ DEMONSTRATION = "a8 w6 f7 wait4 r4 space wait10"
 class TeleopConfig:
     """Opens a desk for driving by keyboard; without a display, presses given keys and writes a video instead."""
 
+    # A, B, C, D, or D_eval, calvin_env's fixed layout of D.
     scene: str = "D"
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
-    # gl, tiny, pybullet_gl or pybullet_tiny.
+    # What draws the pictures: gl, tiny, pybullet_gl or pybullet_tiny.
     renderer: str = "gl"
     # Start in a random state in which this task is feasible; everything closed and off by default.
     task: str | None = None
+    # Decides the first start state; BACKSPACE counts it up.
     seed: int = 0
     # Keep demonstrations here, in CALVIN's format: ENTER begins one, ENTER after a fulfilled task keeps it.
     output_dir: Path | None = None

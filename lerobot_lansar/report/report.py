@@ -19,16 +19,16 @@ from .results import DEFAULT_SEED, collect, read_eval_info, read_lines, summaris
 class ReportConfig:
     """Success rates of one evaluation on the CALVIN desk, printed and saved with two plots."""
 
-    # --output_dir of the lerobot-eval run: the folder of eval_info.json
+    # Folder of eval_info.json: --output_dir of the lerobot-eval run.
     eval_dir: Path
-    # where to write report.json, report.md and the plots; eval_dir by default
+    # Where to write report.json, report.md and the plots; eval_dir by default.
     output_dir: Path | None = None
-    # --env.results_dir of that run, the folder of episodes.jsonl; eval_dir by default
+    # Folder of episodes.jsonl: --env.results_dir of that run; eval_dir by default.
     results_dir: Path | None = None
-    # --seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000
+    # Seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000.
     seed: int | None = None
-    # --policy.path of that run, a folder or a name on the hub; the report then states whether the policy reads the
-    # simulator's own state, and whether it was evaluated in the look of its dataset
+    # The run's policy (--policy.path), a folder or a name on the hub. With it the report states whether the policy reads
+    # the simulator's own state, and whether it was evaluated in the look of its dataset.
     policy_path: str | None = None
 
 

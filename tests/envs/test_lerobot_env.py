@@ -5,13 +5,11 @@ import io
 import json
 import sys
 from contextlib import redirect_stdout
-from dataclasses import fields
 
 import draccus
 import numpy as np
 import pytest
 import torch
-from draccus.wrappers.docstring import get_attribute_docstring
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -46,12 +44,7 @@ def test_features_follow_the_cameras():
         CalvinEnvConfig(cameras=["wrist"])
 
 
-def test_every_option_of_the_desk_is_explained_by_help():
-    inherited = {field.name for field in fields(EnvConfig)}
-    own = {field.name for field in fields(CalvinEnvConfig)} - inherited | {"task", "fps"}
-    explained = {name for name in own if get_attribute_docstring(CalvinEnvConfig, name).comment_above}
-    assert explained == own
-    assert len(own) == 20
+def test_help_prints_the_comments_above_the_desks_options():
     text = io.StringIO()
     with pytest.raises(SystemExit), redirect_stdout(text):
         draccus.parse(CalvinEnvConfig, args=["--help"])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from draccus.wrappers import docstring
 from huggingface_hub import ModelCard
 from torch import nn
 
@@ -260,15 +259,6 @@ def test_impossible_options_are_refused_with_the_option_named():
         small_config(use_images=False, use_spatial_context=False)
     with pytest.raises(ValueError, match=r"--policy.clip.model='nope'"):
         LanSARPolicy(small_config(clip=ClipConfig("nope", "")))
-
-
-@pytest.mark.parametrize("options", [LanSARConfig, ClipConfig, LinearWarmupDecaySchedulerConfig])
-def test_every_option_is_explained_by_help(options):
-    """draccus takes the text from the comment above the field; argparse would trip over a percent sign in it."""
-    for name in options.__annotations__:
-        text = docstring.get_preferred_help_text(docstring.get_attribute_docstring(options, name))
-        assert text, name
-        assert "%" not in text, name
 
 
 def test_missing_features_are_named():
