@@ -1,118 +1,85 @@
-"""Reading one split of a CALVIN dataset from disk: the language index, the scenes and the frames.
+"""One split of a CALVIN dataset on disk: its recordings, scenes, annotated windows and frames.
 
 Layout of a split (`training/` or `validation/`), of the public data and of `lansar-record` alike::
 
     episode_0000000.npz ...            one file per frame
     ep_start_end_ids.npy               (N, 2) first and last frame of each uninterrupted recording
-    scene_info.npy                     pickled {scene name: [first frame, last frame]}
-    lang_annotations/auto_lang_ann.npy pickled {"language": {"ann", "task"}, "info": {"indx"}}
+    scene_info.npy                     pickled {scene name: [first frame, last frame]}; public data: in training/ only
+    lang_annotations/auto_lang_ann.npy pickled {"language": {"ann", "task", "emb"}, "info": {"indx"}}
 
 A language window is `[start, end)`: its end is exclusive. Recordings and scenes include their last frame.
 """
 
-import errno
 import hashlib
-import os
-import reprlib
-import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from dataset_convert.safe_pickle import load_object_array, parse_npy, read_index_file
-from lerobot_lansar.calvin import CAMERAS
-
-VECTORS = {"robot_obs": (15,), "scene_obs": (24,), "actions": (7,), "rel_actions": (7,)}
-"""Shapes of the float vectors stored in every frame file."""
-
-RGB = {f"rgb_{camera}": (size, size, 3) for camera, size in CAMERAS.items()}
-"""Shapes of the uint8 pictures stored in a frame file, unless it was recorded without cameras."""
-
-DEPTH = {f"depth_{camera}": (size, size) for camera, size in CAMERAS.items()}
-"""Shapes of the floating-point distances (m) of both cameras, in public data."""
-
-TACTILE = {"rgb_tactile": (160, 120, 6), "depth_tactile": (160, 120, 2)}
-"""Shapes of the pictures of the two fingertip sensors side by side: uint8 colours, floating-point depth."""
-
-_SHAPES = VECTORS | RGB | DEPTH | TACTILE
-
-_MAX_BYTES = 1 << 20
-"""Limit for one array; the largest of a frame takes less than half of it."""
-
-_SAFE_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Compression methods of which zipfile unpacks no more than it is asked for; numpy uses no others."""
-
-_REPAIR = "download or record it again"
-_NO_PICTURES = "recorded without cameras? then use --images=none and no --embed"
-_NO_EXTRA = "not recorded? then leave out --depth and --tactile"
-
-
-@dataclass(frozen=True)
-class Window:
-    """One annotated demonstration: frames `start` to `end - 1` of the split.
-
-    Attributes:
-        start: First frame number.
-        end: First frame number after the window: exclusive in CALVIN, which is easy to get wrong.
-        task: Task name, such as `open_drawer`.
-        sentence: The command in words.
-        scene: The scene's letter, such as `D`.
-    """
-
-    start: int
-    end: int
-    task: str
-    sentence: str
-    scene: str
-
-    def __len__(self) -> int:
-        return self.end - self.start
+from dataset_convert.frames import frame_file, frame_numbers, read_frame
+from dataset_convert.language import LANG_FOLDER, find_faults, language_file, read_windows
+from dataset_convert.safe_pickle import parse_npy, read_index_file
+from dataset_convert.scenes import find_scenes
 
 
 class CalvinSplit:
     """The index of one split, read and checked once; frames are read on demand.
 
+    Args:
+        root: The dataset's folder.
+        split: The split's name.
+        lang_folder: Name of the split's folder with the language index.
+        scene: Letter of the scene that all of the split was recorded in, where no file says it; "" if it is not known.
+        skip_bad: List faulty windows in `faults`; otherwise the first one is an error.
+
     Attributes:
         root: The dataset's folder.
         name: The split's name.
         folder: The split's folder.
+        language: The language index.
         scenes: Scene letter to its (first, last) frame, both inclusive.
+        scenes_from: Where the scenes are known from, for people.
         windows: The annotated windows in the file's order.
+        faults: Numbers of the windows that cannot become an episode, and why not.
         recordings: (N, 2) first and last frame of each uninterrupted recording, in order.
         source_sha256: Hash of the index files, which identifies what was converted.
 
     Raises:
         FileNotFoundError: The folder or one of its index files is missing.
-        ValueError: An index file is malformed, or a window lies outside every scene or recording.
+        ValueError: An index file is malformed, or a window is faulty and `skip_bad` is off.
     """
 
-    def __init__(self, root: Path, split: str):
+    def __init__(
+        self, root: Path, split: str, *, lang_folder: str = LANG_FOLDER, scene: str = "", skip_bad: bool = False
+    ):
         self.root, self.name = root, split
         self.folder = root / split
         if not self.folder.is_dir():
-            found = sorted(p.parent.name for p in root.glob("*/lang_annotations"))
+            found = sorted(path.parent.name for path in root.glob("*/ep_start_end_ids.npy"))
             raise FileNotFoundError(
                 f"{self.folder} is not a folder: --root must hold --split={split}"
                 + (f" (splits found: {', '.join(found)})" if found else " with CALVIN's files")
             )
-        index = self.folder / "lang_annotations" / "auto_lang_ann.npy"
-        scenes = self.folder / "scene_info.npy"
-        recordings = self.folder / "ep_start_end_ids.npy"
-        self.scenes = _read_scenes(scenes)
-        self.windows = _read_windows(index, self.scenes)
-        self.recordings = _read_recordings(recordings)
-        _check_inside_recordings(self.windows, self.recordings, index)
+        index = self.folder / "ep_start_end_ids.npy"
+        self.recordings = _read_recordings(index)
+        scenes = find_scenes(self.folder, self.recordings, scene)
+        self.scenes, self.scenes_from = scenes.ranges, scenes.source
+        self.language = language_file(self.folder, lang_folder)
+        self.windows = read_windows(self.language, self.scenes)
+        self.faults = find_faults(self.windows, self.recordings)
+        if self.faults and not skip_bad:
+            first = next(iter(self.faults.values()))
+            raise ValueError(
+                f"{self.language}: {first} ({len(self.faults)} such windows; --skip_bad=true leaves them out)"
+            )
         digest = hashlib.sha256()
-        for path in (index, scenes, recordings):
-            digest.update(path.read_bytes())
+        for path in (self.language, scenes.file, index):
+            digest.update(path.read_bytes() if path else b"")
         self.source_sha256 = digest.hexdigest()
 
     def frame_file(self, frame: int) -> Path:
         """The file of one frame, whether or not it exists."""
-        return self.folder / f"episode_{frame:07d}.npz"
+        return frame_file(self.folder, frame)
 
     def frames(self) -> np.ndarray:
         """The numbers of all frame files there are, sorted, (n,) int64."""
@@ -136,134 +103,19 @@ class CalvinSplit:
         """
         columns: dict[str, list[np.ndarray]] = {key: [] for key in keys}
         for frame in frames:
-            path = self.frame_file(frame)
-            for key, array in _load(path, columns).items():
-                columns[key].append(_checked(array, key, path))
+            for key, array in read_frame(self.frame_file(frame), columns).items():
+                columns[key].append(array)
         return {key: np.stack(column) for key, column in columns.items()}
-
-
-def digest(arrays: dict[str, np.ndarray], so_far: Any = None) -> Any:
-    """SHA-256 of some frames' arrays, continued from the frames before.
-
-    Args:
-        arrays: What `CalvinSplit.read` returned.
-        so_far: What this returned for the frames before.
-    """
-    so_far = so_far or hashlib.sha256()
-    for key in sorted(arrays):
-        array = np.ascontiguousarray(arrays[key])
-        so_far.update(f"{key} {array.dtype.str} {array.shape}".encode())
-        so_far.update(array)
-    return so_far
-
-
-def frame_numbers(folder: Path) -> np.ndarray:
-    """The numbers of the frame files in a split's folder, sorted, (n,) int64."""
-    names = (entry.name for entry in os.scandir(folder))
-    numbers = [name[8:-4] for name in names if name.startswith("episode_") and name.endswith(".npz")]
-    return np.sort(np.array([number for number in numbers if number.isdecimal()], dtype=np.int64))
-
-
-def _load(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
-    try:
-        with zipfile.ZipFile(path) as stored:
-            members = stored.NameToInfo
-            missing = [key for key in keys if f"{key}.npy" not in members]
-            if not missing:
-                return {key: parse_npy(_read_member(stored, members[f"{key}.npy"])) for key in keys}
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"{path} is missing: the split is incomplete, {_REPAIR}") from error
-    except MemoryError:
-        raise  # the machine's fault: no more than _MAX_BYTES are read, whatever the file says
-    except Exception as error:  # damaged bytes make zipfile and numpy raise nearly anything
-        fault = error.__context__ if isinstance(error, zipfile.BadZipFile) else error  # zipfile hides some OSErrors
-        if isinstance(fault, OSError) and fault.errno != errno.EINVAL:  # a damaged offset gives EINVAL
-            raise OSError(fault.errno, fault.strerror, str(path)) from error
-        raise ValueError(f"{path}: truncated or not an npz file ({error!r}); {_REPAIR}") from error
-    remedy = _NO_PICTURES if missing[0] in RGB else _REPAIR if missing[0] in VECTORS else _NO_EXTRA
-    raise ValueError(f"{path}: array {missing[0]!r} is missing; {remedy}")
-
-
-def _read_member(stored: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Reads no more than an array takes, even if the file claims or would unpack to more."""
-    if member.file_size > _MAX_BYTES:
-        raise ValueError(f"{member.filename} has {member.file_size} bytes, more than any array of a frame")
-    if member.compress_type not in _SAFE_COMPRESSION:
-        raise ValueError(f"{member.filename} is compressed by method {member.compress_type}, which numpy does not use")
-    with stored.open(member) as file:
-        return file.read(member.file_size)
-
-
-def _checked(array: np.ndarray, key: str, path: Path) -> np.ndarray:
-    shape, is_color = _SHAPES[key], key.startswith("rgb_")
-    is_right_kind = array.dtype == np.uint8 if is_color else array.dtype.kind == "f"
-    if array.shape != shape or not is_right_kind:
-        wanted = f"{'uint8' if is_color else 'float'} {shape}"
-        raise ValueError(f"{path}: array {key!r} is {array.dtype} {array.shape}, expected {wanted}")
-    return array
-
-
-def _read_scenes(path: Path) -> dict[str, tuple[int, int]]:
-    stored = load_object_array(path)
-    scenes: dict[str, tuple[int, int]] = {}
-    try:
-        for name, (first, last) in stored.items():
-            scenes[str(name).rpartition("_")[2]] = (int(first), int(last))
-    except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        wanted = "{scene name: [first frame, last frame]}"
-        raise ValueError(f"{path}: expected {wanted}, found {reprlib.repr(stored)}") from error
-    if not scenes:
-        raise ValueError(f"{path} names no scene")
-    return scenes
 
 
 def _read_recordings(path: Path) -> np.ndarray:
     content = read_index_file(path)
     try:
         recordings = parse_npy(content).reshape(-1, 2)
-        if recordings.dtype.kind not in "iu":
-            raise ValueError(f"found {recordings.dtype}")
+        if recordings.dtype.kind not in "iu" or not len(recordings):
+            raise ValueError(f"found {recordings.dtype} {recordings.shape}")
+        if (recordings < 0).any() or (recordings[:, 1] < recordings[:, 0]).any():
+            raise ValueError("a recording ends before it begins")
     except Exception as error:  # damaged bytes make numpy's header parser raise nearly anything
         raise ValueError(f"{path}: expected (N, 2) first and last frame numbers ({error!r})") from error
     return recordings[np.argsort(recordings[:, 0])].astype(np.int64)
-
-
-def _read_windows(path: Path, scenes: dict[str, tuple[int, int]]) -> list[Window]:
-    stored = load_object_array(path)
-    try:
-        spans = [(int(start), int(end)) for start, end in stored["info"]["indx"]]
-        sentences, tasks = (_strings(stored["language"][key]) for key in ("ann", "task"))
-        if not len(spans) == len(sentences) == len(tasks):
-            raise ValueError(f"{len(spans)} windows, {len(sentences)} sentences, {len(tasks)} tasks")
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        wanted = "language.ann, language.task and info.indx of one length"
-        raise ValueError(f"{path}: expected {wanted} ({error})") from error
-    if not spans:
-        raise ValueError(f"{path}: holds no annotated window")
-    windows = []
-    for (start, end), task, sentence in zip(spans, tasks, sentences, strict=True):
-        if end <= start:
-            raise ValueError(f"{path}: window [{start}, {end}) of {task!r} is empty")
-        letters = [letter for letter, (first, last) in scenes.items() if first <= start and end - 1 <= last]
-        if not letters:
-            raise ValueError(
-                f"{path}: window [{start}, {end}) lies in no scene of scene_info.npy {scenes}; public "
-                "downloads before 2023-02-24 hold a wrong scene_info.npy: replace it"
-            )
-        windows.append(Window(start, end, task, sentence, letters[0]))
-    return windows
-
-
-def _strings(stored: Iterable[Any]) -> list[str]:
-    if not all(isinstance(item, str) for item in stored):
-        raise TypeError("a command or a task is not a string")
-    return [str(item) for item in stored]
-
-
-def _check_inside_recordings(windows: list[Window], recordings: np.ndarray, index: Path) -> None:
-    """A window across two recordings would join frames that are not 1/30 s apart."""
-    at = np.searchsorted(recordings[:, 0], [window.start for window in windows], side="right") - 1
-    for window, row in zip(windows, at, strict=True):
-        if row < 0 or window.end - 1 > recordings[row, 1]:
-            span = f"[{window.start}, {window.end})"
-            raise ValueError(f"{index}: window {span} is not inside one recording of ep_start_end_ids.npy")

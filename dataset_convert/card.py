@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name
 from dataset_convert.layout import MANIFEST
 from lerobot_lansar.calvin import COLORS
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
-_ACTION = {"rel": _REL, "abs": f"{_ABS}; the roll in [0, 2π), where a hand that points down has no jump"}
+_ACTION = {"rel": _REL, "abs": _ABS}
 
 _MEANING = {
     "observation.state": "`robot_obs`: TCP pose (m, rad), gripper width (m), 7 joints (rad), gripper action",
@@ -97,11 +98,13 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
   Every frame was checked: finite, of the right shape and type, relative actions equal to what absolute actions and
   states imply, no frame missing. `{MANIFEST}` has a SHA-256 of every episode's source frames and of every
   file in `data`, `videos` and `meta` but itself; `lansar-verify` compares this dataset with its source.
+* **Angles** of states and absolute actions: roll in [0, 2π), pitch in [−π, π), yaw in [−π/2, 3π/2), so that no pose
+  that the arm reaches jumps. CALVIN's own roll jumps between π and −π, where a hand that points down has it.
 * **Windows** end before their last number, as in CALVIN.{_windows(manifest, used)}
-* **Scenes:** {scenes}. Blocks are always red, blue, pink here.
+* **Scenes:** {scenes}; known from {manifest["scenes_from"]}. Blocks are always red, blue, pink here.
 * **Privileged state:** `observation.environment_state` is the simulator's own state (block poses, joints,
   lights). A real robot does not have it; results of policies that read it must say so.
-{_clip(clip)}
+{_clip(clip)}{_lang(request)}
 | task | windows |
 | --- | ---: |
 {tasks}
@@ -169,6 +172,14 @@ def _colors(manifest: dict[str, Any]) -> str:
                     wrong += count
                     wrongs.append(f"{count} × {risen} instead of {named} in scene {letter}")
     found = f"except in {wrong} ({', '.join(wrongs)}), which are here as annotated" if wrong else "in all"
+    against = manifest["contradictions"]
+    if against:
+        what = "; ".join(f"scene {scene}: {'; '.join(texts)}" for scene, texts in against.items())
+        option = f"--block_order={manifest['request']['block_order']}"
+        return (
+            f"**Colours or scenes are wrong:** {what}. Converted all the same, with `{option}`: do not trust the "
+            "colours of blocks, in commands or in `observation.environment_state`."
+        )
     return (
         f"**Wrong colours:** {total} annotated windows of the split lift a block, by `scene_obs`. It is the one that "
         f"the task names {found}. Other tasks than `lift_…` were not examined."
@@ -193,6 +204,17 @@ def _clip(clip: dict[str, Any] | None) -> str:
         f"* **CLIP embeddings** of both cameras' pictures: `clip/*.npy`, float16 by absolute `index`, of open_clip's\n"
         f"  {clip['model']} {clip['pretrained'] or 'untrained'}, SHA-256 of its weights `{clip['weights_sha256']}`;\n"
         "  `clip/clip.json` has a SHA-256 of both arrays.\n"
+    )
+
+
+def _lang(request: dict[str, Any]) -> str:
+    if not request.get("lang_embeddings"):
+        return ""
+    folder = request.get("lang_folder", LANG_FOLDER)
+    file = f"{EMBEDDINGS}/{embeddings_name(folder)}.npy"
+    return (
+        f"* **Sentence embeddings** of the source's `{folder}`: `{file}`, float32,\n"
+        "  a row per window (`calvin.window`); the `.json` beside it names the encoder.\n"
     )
 
 

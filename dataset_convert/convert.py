@@ -13,10 +13,11 @@ import draccus
 from dataset_convert import card
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.embed import SourcePictures, embed, load_clip
+from dataset_convert.episodes import as_ranges
 from dataset_convert.hub import push
 from dataset_convert.layout import MANIFEST
 from dataset_convert.options import ConvertConfig
-from dataset_convert.plan import make_plan, warn
+from dataset_convert.plan import EXCLUDE_SHARED, make_plan, warn
 from dataset_convert.shards import DATASET, SHARDS, Job, convert_shard, frames_done, staging_of
 from lerobot_lansar.command import CommandError, run_command
 from lerobot_lansar.jobs.executors import run_shards
@@ -49,7 +50,7 @@ def convert(config: ConvertConfig) -> Path:
     """
     config.check()
     config = replace(config, root=config.root.resolve(), output_dir=config.target.resolve())
-    split = CalvinSplit(config.root, config.split)
+    split = config.open_split()
     request = config.request(split)
     if _is_done(config.target, request):
         _check_license(config)
@@ -96,6 +97,9 @@ def conclude(
         warn(f"left out: frames {bad['start']}-{bad['end'] - 1}: {bad['reason']}")
     if left_out:
         warn(f"{len(left_out)} defective episodes were left out; {MANIFEST} lists them")
+    late = sorted(set(manifest["shared_frames"]) - set(report["shared_frames"]))
+    if late:
+        warn(f"frames {as_ranges(late)} are in validation too, as converting showed; {EXCLUDE_SHARED}")
     _embed_and_push(config, job.split)
 
 

@@ -1,11 +1,12 @@
 """Which frames become an episode: annotated windows, or whole recordings in which windows are annotations."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from dataset_convert.calvin import CalvinSplit, Window, frame_numbers
+from dataset_convert.calvin import CalvinSplit
+from dataset_convert.language import Window
 
 MODES = ("windows", "play")
 DEDUP = ("none", "task", "frames")
@@ -36,7 +37,7 @@ class Span:
         return self.end - self.start
 
 
-def window_spans(windows: list[Window], dedup: str, excluded: Iterable[int]) -> list[Span]:
+def window_spans(windows: list[Window], dedup: str, excluded: Iterable[int], faults: Container[int] = ()) -> list[Span]:
     """One episode per annotated window, in the language file's order.
 
     Windows of the public data are random cuts that overlap: on split D every frame occurs 1.58 times.
@@ -46,10 +47,11 @@ def window_spans(windows: list[Window], dedup: str, excluded: Iterable[int]) -> 
         dedup: "none" keeps all; "task" keeps as many as possible of which no two show the same task and share
             a frame; "frames" as many as possible of which no two share a frame at all.
         excluded: Frames that no episode may contain.
+        faults: Numbers of windows that are left out.
     """
     forbidden = np.unique(np.fromiter(excluded, dtype=np.int64))
     inside = [np.searchsorted(forbidden, w.end) > np.searchsorted(forbidden, w.start) for w in windows]
-    numbers = [number for number, is_excluded in enumerate(inside) if not is_excluded]
+    numbers = [number for number, is_excluded in enumerate(inside) if not is_excluded and number not in faults]
     if dedup != "none":
         numbers = _without_overlap(windows, numbers, lambda number: windows[number].task if dedup == "task" else None)
     return [Span(windows[n].start, windows[n].end, windows[n].scene, (n,)) for n in numbers]
@@ -69,12 +71,12 @@ def _without_overlap(windows: list[Window], numbers: list[int], group: Callable[
 def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
     """One episode per uninterrupted recording with its windows, cut at excluded frames and after `MAX_FRAMES`.
 
-    Raises:
-        ValueError: A recording lies in no scene.
+    The scene of an episode that lies in none is "".
     """
     forbidden = sorted(set(excluded))
     starts = np.array([window.start for window in split.windows])
     ends = np.array([window.end for window in split.windows])
+    good = ~np.isin(np.arange(len(starts)), list(split.faults))
     spans = []
     for first, last in split.recordings.tolist():
         cuts = [frame for frame in forbidden if first <= frame <= last]
@@ -82,7 +84,7 @@ def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
         for start, end in zip(edges[::2], edges[1::2], strict=True):
             while start < end:
                 stop = _cut(start, end, starts, ends)
-                inside = np.flatnonzero((starts >= start) & (ends <= stop))
+                inside = np.flatnonzero((starts >= start) & (ends <= stop) & good)
                 spans.append(Span(start, stop, _scene_of(split, start, stop), tuple(inside.tolist())))
                 start = stop
     return spans
@@ -104,10 +106,7 @@ def _scene_of(split: CalvinSplit, start: int, end: int) -> str:
     for letter, (first, last) in split.scenes.items():
         if first <= start and end - 1 <= last:
             return letter
-    raise ValueError(
-        f"{split.folder / 'ep_start_end_ids.npy'}: recording [{start}, {end}) lies in no scene of scene_info.npy "
-        f"{split.scenes}"
-    )
+    return ""
 
 
 def window_of_frames(span: Span, windows: list[Window]) -> np.ndarray:
@@ -120,14 +119,6 @@ def window_of_frames(span: Span, windows: list[Window]) -> np.ndarray:
     for number in sorted(span.windows, key=lambda n: (-windows[n].end, windows[n].start)):
         numbers[windows[number].start - span.start : windows[number].end - span.start] = number
     return numbers
-
-
-def shared_frames(split: CalvinSplit) -> list[int]:
-    """Frames that are in training/ and in validation/; the public ABCD data have four of them."""
-    training, validation = split.root / "training", split.root / "validation"
-    if not (training.is_dir() and validation.is_dir()):
-        return []
-    return np.intersect1d(frame_numbers(training), frame_numbers(validation)).tolist()
 
 
 def missing_frames(spans: list[Span], present: np.ndarray) -> list[int]:

@@ -17,7 +17,7 @@ from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, Datase
 from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from dataset_convert.calvin import DEPTH, RGB, TACTILE
+from dataset_convert.frames import DEPTH, RGB, TACTILE
 from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder
 from dataset_convert.stats import Stats
 from lerobot_lansar.calvin import ACTION_NAMES, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dataset_convert import features
+from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, read_embeddings, write_embeddings
 from dataset_convert.layout import MANIFEST, RGBEncoder
 from dataset_convert.shards import Job, describe
 from dataset_convert.stats import Stats
@@ -38,10 +39,12 @@ def finish(job: Job, info: Any, encoder: RGBEncoder, request: dict[str, Any], re
     episodes, frames, first_shard = 0, 0, None
     files: dict[str, str] = {}
     left_out, kept = list(report["left_out"]), []
+    shared = set(report["shared_frames"])
     stats: list[Stats] = []
     for shard in range(len(job.shards)):
         note = json.loads(job.note(shard).read_text())
         left_out += note["left_out"]
+        shared.update(note["shared"])
         if not note["episodes"]:
             continue
         first_shard = shard if first_shard is None else first_shard
@@ -72,8 +75,11 @@ def finish(job: Job, info: Any, encoder: RGBEncoder, request: dict[str, Any], re
         frames,
         features.merge_stats(stats),
     )
+    if request.get("lang_embeddings"):
+        rows = read_embeddings(job.split.language, len(job.split.windows))
+        write_embeddings(job.dataset, request.get("lang_folder", LANG_FOLDER), rows)
     # The manifest is what is left in meta: it is written last and cannot hold its own hash.
-    for path in sorted((job.dataset / "meta").rglob("*")):
+    for path in sorted(path for part in ("meta", EMBEDDINGS) for path in (job.dataset / part).rglob("*")):
         if path.is_file() and path != job.dataset / MANIFEST:
             files[path.relative_to(job.dataset).as_posix()] = sha256(path)
     here = f"{job.split.root}{os.sep}"  # no path of this machine is published
@@ -86,6 +92,7 @@ def finish(job: Job, info: Any, encoder: RGBEncoder, request: dict[str, Any], re
         "scene_names": job.scene_names,
         "versions": {name: version(name) for name in ("lerobot_policy_lansar", "lerobot", "numpy", "av")},
         **report,
+        "shared_frames": sorted(shared),
         "left_out": left_out,
         "windows": [
             {"start": w.start, "end": w.end, "task": w.task, "sentence": w.sentence, "scene": w.scene}

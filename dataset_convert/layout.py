@@ -9,6 +9,9 @@ import pyarrow as pa
 MANIFEST = "meta/calvin_source.json"
 """The file, relative to the dataset's folder, that says what a dataset was made from and how."""
 
+FORMAT = 2
+"""Of what is written, in the manifest. 1 had CALVIN's own angles in states, which jump."""
+
 
 # H.264 at these settings keeps pictures as well as LeRobot's default (libsvtav1, crf 30) in a tenth of the time, takes
 # a seventh more bytes, and decodes faster (docs/dataset.md).

@@ -4,11 +4,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dataset_convert.blocks import BLOCK_ORDERS
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.embed import ClipOptions
 from dataset_convert.episodes import DEDUP, MODES
 from dataset_convert.hub import folder_of
-from dataset_convert.layout import RGBEncoder
+from dataset_convert.language import LANG_FOLDER
+from dataset_convert.layout import FORMAT, RGBEncoder
 from lerobot_lansar.calvin import CONTROL_MODES
 from lerobot_lansar.jobs.executors import check_executor
 from lerobot_lansar.jobs.work import SlurmConfig
@@ -28,6 +30,12 @@ class ConvertConfig:
     output_dir: Path | None = None
     # Split to convert: training or validation.
     split: str = "training"
+    # Scene that all of the split was recorded in, if no file says it; validation/ is D unless one does.
+    scene: str = ""
+    # The split's folder with auto_lang_ann.npy, such as lang_paraphrase-MiniLM-L3-v2.
+    lang_folder: str = LANG_FOLDER
+    # Keep the sentence embeddings of that folder beside the data.
+    lang_embeddings: bool = False
     # windows: one episode per annotated window; play: one per uninterrupted recording, in which the annotated windows
     # give frames their command.
     mode: str = "windows"
@@ -37,6 +45,9 @@ class ConvertConfig:
     exclude_shared: bool = False
     # Leave out defective episodes and list them, instead of stopping at the first.
     skip_bad: bool = False
+    # Order of the blocks in scene_obs. checked: that of the scene, and an error if lifts or doors contradict it; known:
+    # that of the scene in any case; lifts: the one that the lifts show.
+    block_order: str = "checked"
     # What `action` holds: rel (relative) or abs (absolute); the other form is kept in another column.
     action: str = "rel"
     # Tell policies that read no language which task is commanded: 34 more numbers in observation.environment_state,
@@ -79,6 +90,7 @@ class ConvertConfig:
             ("mode", MODES),
             ("dedup", DEDUP),
             ("images", IMAGES),
+            ("block_order", BLOCK_ORDERS),
         ):
             if getattr(self, name) not in choices:
                 raise ValueError(f"--{name}={getattr(self, name)}: expected {' or '.join(choices)}")
@@ -96,6 +108,12 @@ class ConvertConfig:
             raise ValueError("--private=true needs --push_to_hub=true: nothing is uploaded without it")
         check_executor(self.executor, self.slurm)
 
+    def open_split(self) -> CalvinSplit:
+        """Reads the source's index."""
+        return CalvinSplit(
+            self.root, self.split, lang_folder=self.lang_folder, scene=self.scene, skip_bad=self.skip_bad
+        )
+
     def request(self, split: CalvinSplit) -> dict[str, Any]:
         """Everything that decides the dataset's frames."""
         names = (
@@ -109,11 +127,22 @@ class ConvertConfig:
             "depth",
             "tactile",
         )
-        encoder = asdict(self.rgb_encoder) if self.images == "video" else None
+        unusual = {
+            name: getattr(self, name)
+            for name, usual in (
+                ("task_in_state", False),
+                ("scene", ""),
+                ("lang_folder", LANG_FOLDER),
+                ("lang_embeddings", False),
+                ("block_order", "checked"),
+            )
+            if getattr(self, name) != usual
+        }
         return {
+            "format": FORMAT,
             "source": self.root.resolve().name,
             "source_sha256": split.source_sha256,
             **{name: getattr(self, name) for name in names},
-            "rgb_encoder": encoder,
-            **({"task_in_state": True} if self.task_in_state else {}),
+            "rgb_encoder": asdict(self.rgb_encoder) if self.images == "video" else None,
+            **unusual,
         }

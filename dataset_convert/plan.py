@@ -4,24 +4,34 @@ import sys
 from bisect import bisect_left
 from typing import Any
 
-from dataset_convert import checks
-from dataset_convert.calvin import RGB, VECTORS, CalvinSplit
+import numpy as np
+
+from dataset_convert import blocks
+from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import (
     NO_COMMAND,
     Span,
     as_ranges,
     missing_frames,
     play_spans,
-    shared_frames,
     window_of_frames,
     window_spans,
 )
+from dataset_convert.frames import RGB, VECTORS
+from dataset_convert.language import read_embeddings
 from dataset_convert.options import ConvertConfig
 from dataset_convert.shards import Job, cut_into_shards, describe, staging_of
-from lerobot_lansar.calvin import BLOCK_ORDER, SCENE_NAMES, TASKS
+from dataset_convert.shared import ValidationStates, find_shared
+from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 
 FRAMES_PER_SHARD = 8000
 """Frames in one parquet file, and in one mp4 per camera (about 30 MB)."""
+
+
+EXCLUDE_SHARED = "--exclude_shared=true leaves them out"
+
+type LeftOut = list[dict[str, Any]]
+"""Descriptions of episodes that are left out, for the manifest."""
 
 
 def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict[str, Any]]:
@@ -32,16 +42,16 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
 
     Raises:
         FileNotFoundError: Frames are missing and `skip_bad` is off, or pictures were not recorded.
-        ValueError: The blocks' order is unclear, or nothing is left to convert.
+        ValueError: The source contradicts what is known of its scenes, or nothing is left to convert.
     """
-    shared = _shared_frames(config, split)
+    if not split.scenes_from.startswith("scene_info"):
+        warn(f"{split.folder}: scene {', '.join(split.scenes)} ({split.scenes_from})")
+    if config.lang_embeddings:
+        read_embeddings(split.language, len(split.windows))  # an error comes now, not after the long part
+    shared, validation = _shared_frames(config, split)
     spans, left_out = _choose_spans(config, split, shared if config.exclude_shared else [])
     scenes = sorted({span.scene for span in spans})
-    votes = {scene: checks.block_votes(split, scene) for scene in scenes}
-    orders = {scene: checks.block_order(scene, votes[scene]) for scene in scenes}
-    for scene, order in orders.items():
-        if order != BLOCK_ORDER.get(scene):
-            warn(f"scene {scene}: block columns are {', '.join(order)}, as its lifts show")
+    orders, report = _block_orders(config, split, scenes)
     unknown_tasks = sorted({window.task for window in split.windows} - set(TASKS))
     if config.task_in_state and unknown_tasks:
         raise ValueError(f"--task_in_state=true: {', '.join(unknown_tasks)} is none of CALVIN's {len(TASKS)} tasks")
@@ -63,15 +73,12 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
         task_names=[*TASKS, *unknown_tasks],
         scene_names=[*SCENE_NAMES, *sorted(set(scenes) - set(SCENE_NAMES))],
         skip_bad=config.skip_bad,
+        also_checked=tuple(RGB) if config.embed else (),
+        validation=None if config.exclude_shared else validation,
     )
-    _check_recorded(config, job)
-    report = {
-        "license": config.license,
-        "shared_frames": shared,
-        "block_votes": {scene: votes[scene].tolist() for scene in scenes},
-        "left_out": left_out,
-    }
-    return job, info, report
+    _check_recorded(job)
+    report |= {"license": config.license, "scenes_from": split.scenes_from, "shared_frames": shared}
+    return job, info, {**report, "left_out": left_out}
 
 
 def warn(text: str) -> None:
@@ -79,37 +86,86 @@ def warn(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def _shared_frames(config: ConvertConfig, split: CalvinSplit) -> list[int]:
-    """Frames that are in training and in validation; prints what happens to them."""
-    shared = shared_frames(split) if config.split == "training" else []
+def _block_orders(
+    config: ConvertConfig, split: CalvinSplit, scenes: list[str]
+) -> tuple[dict[str, tuple[str, ...]], dict[str, Any]]:
+    """Each scene's block order, and what speaks for and against it.
+
+    Raises:
+        ValueError: Something speaks against it and the user has not decided.
+    """
+    orders, votes, against = {}, {}, {}
+    for scene in scenes:
+        evidence = blocks.gather_evidence(split, scene)
+        contrary = blocks.contradictions(scene, evidence)
+        if contrary and config.block_order == "checked":
+            raise ValueError(blocks.complaint(scene, contrary))
+        orders[scene] = blocks.block_order(scene, evidence.votes, config.block_order)
+        votes[scene] = evidence.votes.tolist()
+        if contrary:
+            against[scene] = contrary
+            warn(f"warning: scene {scene}: {'; '.join(contrary)}; --block_order={config.block_order} takes no notice")
+    return orders, {"block_votes": votes, "contradictions": against}
+
+
+def _shared_frames(config: ConvertConfig, split: CalvinSplit) -> tuple[list[int], ValidationStates | None]:
+    """Frames that are in training and in validation, of which it prints what happens to them; validation's states."""
+    workers = config.workers if config.executor == "local" else 1
+    validation = ValidationStates.read(split.root / "validation", workers) if config.split == "training" else None
+    if validation is None:
+        return [], None
+    shared = find_shared(split, validation, _planned_frames(config, split) if config.exclude_shared else None, workers)
     if shared:
         used = [f for f in shared if any(first <= f <= last for first, last in split.recordings)]
-        fate = "left out" if config.exclude_shared else "kept; --exclude_shared=true leaves them out"
+        fate = "left out" if config.exclude_shared else f"kept; {EXCLUDE_SHARED}"
         fate = f"{len(used)} of them inside training's recordings, {fate}" if used else "in no recording, not converted"
         warn(f"frames {as_ranges(shared)} are in training and in validation: {fate}")
-    return shared
+    return shared, validation
 
 
-def _choose_spans(
-    config: ConvertConfig, split: CalvinSplit, excluded: list[int]
-) -> tuple[list[Span], list[dict[str, Any]]]:
-    """The episodes, and descriptions of those that are left out because frames are missing."""
+def _planned_frames(config: ConvertConfig, split: CalvinSplit) -> np.ndarray:
+    """Frames that can become part of an episode; some of them several times."""
+    if config.mode == "play":
+        spans = [(first, last + 1) for first, last in split.recordings.tolist()]
+    else:
+        spans = [(w.start, w.end) for number, w in enumerate(split.windows) if number not in split.faults]
+    return np.concatenate([np.arange(start, end) for start, end in spans])
+
+
+def _choose_spans(config: ConvertConfig, split: CalvinSplit, excluded: list[int]) -> tuple[list[Span], LeftOut]:
+    """The episodes, and descriptions of those that cannot become one."""
     if config.mode == "play":
         spans = play_spans(split, excluded)
     else:
-        spans = window_spans(split.windows, config.dedup, excluded)
-    spans, left_out = _without_missing(config, split, spans)
+        spans = window_spans(split.windows, config.dedup, excluded, split.faults)
+    windows = split.windows
+    faulty = [(Span(windows[n].start, windows[n].end, windows[n].scene, (n,)), why) for n, why in split.faults.items()]
+    left_out = [{**describe(span), "reason": reason} for span, reason in faulty]
+    for step in (_without_scene, _without_missing):
+        spans, lost = step(config, split, spans)
+        left_out += lost
     if not spans:
-        raise ValueError(f"{split.folder}: no episode is left to convert")
+        first = f"; the first: {left_out[0]['reason']}" if left_out else ""
+        raise ValueError(f"{split.folder}: no episode is left to convert{first}")
     inside = sum(len(span.windows) for span in spans)
     if inside < len(split.windows):
         warn(f"{len(split.windows) - inside} of {len(split.windows)} annotated windows are left out")
     return spans, left_out
 
 
-def _without_missing(
-    config: ConvertConfig, split: CalvinSplit, spans: list[Span]
-) -> tuple[list[Span], list[dict[str, Any]]]:
+def _without_scene(config: ConvertConfig, split: CalvinSplit, spans: list[Span]) -> tuple[list[Span], LeftOut]:
+    """Leaves out recordings that lie in no scene."""
+    lost = [span for span in spans if not span.scene]
+    reason = f"lies in no scene of scene_info.npy {split.scenes}"
+    if lost and not config.skip_bad:
+        raise ValueError(
+            f"{split.folder / 'ep_start_end_ids.npy'}: recording [{lost[0].start}, {lost[0].end}) {reason}"
+        )
+    return [span for span in spans if span.scene], [{**describe(span), "reason": reason} for span in lost]
+
+
+def _without_missing(config: ConvertConfig, split: CalvinSplit, spans: list[Span]) -> tuple[list[Span], LeftOut]:
+    """Leaves out episodes of which frames are missing."""
     missing = missing_frames(spans, split.frames())
     if not missing:
         return spans, []
@@ -137,20 +193,20 @@ def _sentences(split: CalvinSplit, spans: list[Span]) -> list[str]:
     return list(found)
 
 
-def _check_recorded(config: ConvertConfig, job: Job) -> None:
+def _check_recorded(job: Job) -> None:
     """Reads an episode's first frame, so that pictures that were not recorded are reported at once.
 
     Raises:
         FileNotFoundError, ValueError: It cannot be read; with `skip_bad`, no episode's first frame can.
     """
-    arrays = dict.fromkeys([*VECTORS, *(RGB if config.embed else ()), *job.arrays()])
+    arrays = [*VECTORS, *job.arrays()]
     first_error: Exception | None = None
     for span in job.spans:
         try:
             job.split.read([span.start], arrays)
             return
         except (FileNotFoundError, ValueError) as error:
-            if not config.skip_bad:
+            if not job.skip_bad:
                 raise
             first_error = first_error or error
     raise ValueError(f"{job.split.folder}: no episode is left to convert; the first: {first_error}") from first_error

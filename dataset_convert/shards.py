@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_convert import checks
-from dataset_convert.calvin import VECTORS, CalvinSplit, digest
+from dataset_convert import blocks, checks
+from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
+from dataset_convert.frames import STATES, VECTORS, digest
 from dataset_convert.layout import Layout
+from dataset_convert.shared import ValidationStates, key_of
 from dataset_convert.writer import FrameBatch, ShardPosition, Written, write_shard
-from lerobot_lansar.calvin import TASKS
+from lerobot_lansar.calvin import TASKS, continuous_euler
 from lerobot_lansar.clip.store import sha256
 from lerobot_lansar.jobs.staging import write_atomically
 
@@ -42,6 +44,8 @@ class Job:
         sentences: The commands; a frame's `task_index` is a place in this list.
         task_names, scene_names: What the numbers in `calvin.task` and `calvin.scene` mean.
         skip_bad: Leave defective episodes out instead of stopping.
+        also_checked: CALVIN's picture arrays that must be readable too, although the dataset may not hold them.
+        validation: States by which frames that are in validation too are noted; None: they are not looked for.
     """
 
     split: CalvinSplit
@@ -56,6 +60,8 @@ class Job:
     task_names: list[str]
     scene_names: list[str]
     skip_bad: bool
+    also_checked: tuple[str, ...] = ()
+    validation: ValidationStates | None = None
 
     @property
     def dataset(self) -> Path:
@@ -72,6 +78,10 @@ class Job:
 
     def arrays(self) -> list[str]:
         """CALVIN's picture arrays that are needed."""
+        return list(dict.fromkeys([*self.stored_arrays(), *self.also_checked]))
+
+    def stored_arrays(self) -> list[str]:
+        """CALVIN's picture arrays that the dataset holds."""
         return list(dict.fromkeys(picture.array for picture in self.layout.pictures))
 
     def limits(self) -> dict[str, tuple[float, float]]:
@@ -82,6 +92,19 @@ class Job:
             for array, codec in codecs.items()
             if codec and codec.depth
         }
+
+
+@dataclass
+class Seen:
+    """What writing a shard showed of its source.
+
+    Attributes:
+        hashes: Of each written episode's source frames.
+        shared: Frames that are in validation too.
+    """
+
+    hashes: list[str] = field(default_factory=list)
+    shared: set[int] = field(default_factory=set)
 
 
 class BadEpisode(Exception):
@@ -149,8 +172,8 @@ def convert_shard(job: Job, shard: int) -> None:
         return
     note.unlink(missing_ok=True)
     bad = _find_bad(job, shard) if job.skip_bad else {}
-    written, hashes = _write_others(job, shard, bad)
-    _take_note(job, shard, bad, written, hashes)
+    written, seen = _write_others(job, shard, bad)
+    _take_note(job, shard, bad, written, seen)
 
 
 def _is_intact(job: Job, note: Path) -> bool:
@@ -173,19 +196,15 @@ def _find_bad(job: Job, shard: int) -> dict[int, str]:
     return bad
 
 
-def _write_others(job: Job, shard: int, bad: dict[int, str]) -> tuple[Written, list[str]]:
-    """Writes the episodes that are not in `bad`, and adds to it those that prove defective.
-
-    Returns:
-        What was written, and the hash of each written episode's source frames.
-    """
+def _write_others(job: Job, shard: int, bad: dict[int, str]) -> tuple[Written, Seen]:
+    """Writes the episodes that are not in `bad`, and adds to it those that prove defective."""
     first = job.shards[shard][0]
     position = ShardPosition(shard, first, sum(len(span) for span in job.spans[:first]))
     while True:
         progress = _Progress(job.note(shard).with_suffix(".count"))
-        hashes: list[str] = []
+        seen = Seen()
         good = (number for number in job.episodes(shard) if number not in bad)
-        episodes = ((len(job.spans[number]), _hashed(job, number, progress, hashes)) for number in good)
+        episodes = ((len(job.spans[number]), _observed(job, number, progress, seen)) for number in good)
         try:
             written = write_shard(job.dataset, job.layout, position, episodes, job.sentences)
         except BadEpisode as error:
@@ -194,10 +213,10 @@ def _write_others(job: Job, shard: int, bad: dict[int, str]) -> tuple[Written, l
             bad[error.number] = str(error.reason)  # a part of it was written: write the others again
         else:
             progress.set(sum(len(job.spans[number]) for number in job.episodes(shard)))
-            return written, hashes
+            return written, seen
 
 
-def _take_note(job: Job, shard: int, bad: dict[int, str], written: Written, hashes: list[str]) -> None:
+def _take_note(job: Job, shard: int, bad: dict[int, str], written: Written, seen: Seen) -> None:
     """Notes that a shard is finished: its episodes, what was left out and why, the hashes of its files."""
     kept = [number for number in job.episodes(shard) if number not in bad]
     files = job.layout.files(shard)
@@ -206,7 +225,8 @@ def _take_note(job: Job, shard: int, bad: dict[int, str], written: Written, hash
             (job.dataset / name).unlink(missing_ok=True)
     _write_rows(job.note(shard).with_suffix(".parquet"), written)
     content = {
-        "episodes": [{"number": n, "sha256": sha} for n, sha in zip(kept, hashes, strict=True)],
+        "episodes": [{"number": n, "sha256": sha} for n, sha in zip(kept, seen.hashes, strict=True)],
+        "shared": sorted(seen.shared),
         "left_out": [describe(job.spans[number]) | {"reason": reason} for number, reason in bad.items()],
         "files": {name: sha256(job.dataset / name) for name in files} if kept else {},
     }
@@ -241,15 +261,18 @@ class _Progress:
 # ---- one episode: from the source's arrays to the dataset's columns
 
 
-def _hashed(job: Job, number: int, progress: _Progress, hashes: list[str]) -> Iterator[FrameBatch]:
-    """An episode's batches; the hash of its source frames is added to `hashes` after the last one."""
+def _observed(job: Job, number: int, progress: _Progress, seen: Seen) -> Iterator[FrameBatch]:
+    """An episode's batches; what they show of the source is added to `seen`."""
     state = None
     for batch, arrays in _read_batches(job, number, with_pictures=True):
-        state = digest(arrays, state)
+        state = digest({key: arrays[key] for key in (*VECTORS, *job.stored_arrays())}, state)
+        if job.validation is not None:
+            keys = np.array([key_of(*rows) for rows in zip(*(arrays[key] for key in STATES), strict=True)], np.uint64)
+            seen.shared.update(job.validation.among(job.split.folder, batch.columns["calvin.frame"], keys))
         yield batch
         progress.add(len(batch))
     assert state is not None
-    hashes.append(state.hexdigest())
+    seen.hashes.append(state.hexdigest())
 
 
 def _read_batches(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[FrameBatch, dict[str, np.ndarray]]]:
@@ -286,16 +309,16 @@ def to_batch(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: d
     task_of = {w: job.task_names.index(listed[w].task) if w >= 0 else -1 for w in set(numbers)}
     sentence_of = {w: job.sentences.index(listed[w].sentence if w >= 0 else NO_COMMAND) for w in set(numbers)}
     tasks = np.array([task_of[w] for w in numbers])
-    scene = checks.reorder_blocks(arrays["scene_obs"], job.block_orders[span.scene])
+    scene = blocks.reorder_blocks(arrays["scene_obs"], job.block_orders[span.scene])
     if job.task_in_state:
         scene = np.concatenate([scene, tasks[:, None] == np.arange(len(TASKS))], axis=1)
+    absolute, relative = with_continuous_angles(arrays["actions"]), arrays["rel_actions"]
     is_absolute = job.action == "abs"
-    other = "rel_actions" if is_absolute else "actions"
     vectors = {
-        "observation.state": arrays["robot_obs"],
+        "observation.state": with_continuous_angles(arrays["robot_obs"]),
         "observation.environment_state": scene,
-        "action": checks.without_roll_jump(arrays["actions"]) if is_absolute else arrays["rel_actions"],
-        f"calvin.{other}": arrays[other],
+        "action": absolute if is_absolute else relative,
+        "calvin.rel_actions" if is_absolute else "calvin.actions": relative if is_absolute else absolute,
     }
     columns = {
         **{key: vector.astype(np.float32) for key, vector in vectors.items()},
@@ -305,4 +328,11 @@ def to_batch(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: d
         "calvin.scene": np.full(len(frames), job.scene_names.index(span.scene)),
     }
     sentences = np.array([sentence_of[w] for w in numbers])
-    return FrameBatch(columns, sentences, {key: arrays[key] for key in job.arrays() if key in arrays})
+    return FrameBatch(columns, sentences, {key: arrays[key] for key in job.stored_arrays() if key in arrays})
+
+
+def with_continuous_angles(poses: np.ndarray) -> np.ndarray:
+    """TCP poses, with whatever follows them, with `continuous_euler` angles: (n, 15) states or (n, 7) actions."""
+    turned = poses.copy()
+    turned[:, 3:6] = continuous_euler(poses[:, 3:6])
+    return turned

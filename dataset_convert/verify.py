@@ -13,6 +13,7 @@ import draccus
 import numpy as np
 from tqdm import tqdm
 
+from dataset_convert.episodes import as_ranges
 from dataset_convert.hub import find_dataset
 from dataset_convert.verify_claims import Dataset, Mismatch, check_claims
 from dataset_convert.verify_frames import Found, verify_file
@@ -51,6 +52,7 @@ def verify(config: VerifyConfig) -> str:
     told = check_claims(dataset)
     found = _verify_frames(dataset, config)
     _check_stats(dataset, found)
+    _check_shared(dataset, found)
     lines = [
         f"{folder}: {len(dataset.spans)} episodes, {found.frames} frames equal {dataset.split.folder}: state, scene "
         "and both forms of the action exactly, as are commands, tasks, scenes, windows and times",
@@ -94,6 +96,19 @@ def _check_stats(dataset: Dataset, found: Found) -> None:
         for name, wanted in (("min", low), ("max", high), ("mean", total / found.frames)):
             if not np.allclose(stats[key][name], wanted, rtol=1e-5, atol=1e-6):
                 raise Mismatch(f"{dataset.folder}/meta/stats.json: {name} of {key} is not that of the frames")
+
+
+def _check_shared(dataset: Dataset, found: Found) -> None:
+    """Frames of training that are in validation too are those that the manifest lists; with exclude_shared, none."""
+    if dataset.validation is None:
+        return
+    listed = set() if dataset.manifest["request"]["exclude_shared"] else set(dataset.manifest["shared_frames"])
+    unlisted = sorted(found.shared - listed)
+    if unlisted:
+        raise Mismatch(
+            f"{dataset.folder}: training and validation share frames {as_ranges(unlisted)}, which are here and "
+            f"{'should be left out' if dataset.manifest['request']['exclude_shared'] else 'are not listed'}"
+        )
 
 
 @draccus.wrap()

@@ -10,18 +10,13 @@ import numpy as np
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from dataset_convert import checks
-from dataset_convert.calvin import DEPTH, RGB, TACTILE, CalvinSplit
-from dataset_convert.episodes import (
-    NO_COMMAND,
-    Span,
-    as_ranges,
-    play_spans,
-    shared_frames,
-    window_of_frames,
-    window_spans,
-)
-from dataset_convert.layout import MANIFEST
+from dataset_convert import blocks
+from dataset_convert.calvin import CalvinSplit
+from dataset_convert.episodes import NO_COMMAND, Span, as_ranges, play_spans, window_of_frames, window_spans
+from dataset_convert.frames import DEPTH, RGB, TACTILE
+from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name, read_embeddings
+from dataset_convert.layout import FORMAT, MANIFEST
+from dataset_convert.verify_shared import ValidationFrames
 from lerobot_lansar.calvin import CONTROL_HZ, SCENE_NAMES, TASKS
 from lerobot_lansar.clip.store import dataset_fingerprint, sha256
 
@@ -41,9 +36,12 @@ class Dataset:
         starts: Absolute index of each episode's first frame.
         windows: The window of each frame, for every episode.
         orders: Scene to the colours of its block columns, found from the source again.
+        contradictions: Scene to what the source says against it.
+        validation: The frames of validation; none if this is not training, or if the source has no validation/ here.
 
     Raises:
         FileNotFoundError: It was not made by `lansar-convert`.
+        ValueError: It was made by an earlier version, of another format.
         Mismatch: It was made from another source, or its files were changed since.
     """
 
@@ -54,8 +52,15 @@ class Dataset:
             )
         self.folder = folder
         self.manifest = json.loads((folder / MANIFEST).read_text())
-        self.split = CalvinSplit(root, self.manifest["request"]["split"])
-        if self.split.source_sha256 != self.manifest["request"]["source_sha256"]:
+        request = self.manifest["request"]
+        if request.get("format", 1) != FORMAT:
+            raise ValueError(
+                f"{folder} was made by another version of lansar-convert (format {request.get('format', 1)}, here "
+                f"{FORMAT}; its angles are CALVIN's own, which jump, if it is 1): convert again"
+            )
+        options = {name: request[name] for name in ("lang_folder", "scene", "skip_bad") if name in request}
+        self.split = CalvinSplit(root, request["split"], **options)
+        if self.split.source_sha256 != request["source_sha256"]:
             raise Mismatch(f"{self.split.folder}: its index files are not those that {folder} was made from")
         _check_files(folder, self.manifest["files"])
         self.info = json.loads((folder / "meta/info.json").read_text())
@@ -64,8 +69,14 @@ class Dataset:
         self.starts = np.cumsum([0, *(len(span) for span in self.spans)])
         self.windows = [window_of_frames(span, self.split.windows) for span in self.spans]
         self.orders: dict[str, tuple[str, ...]] = {}
+        self.contradictions: dict[str, list[str]] = {}
         for scene in sorted({span.scene for span in self.spans}):
-            self.orders[scene] = checks.block_order(scene, checks.block_votes(self.split, scene))
+            evidence = blocks.gather_evidence(self.split, scene)
+            if found := blocks.contradictions(scene, evidence):
+                self.contradictions[scene] = found
+            self.orders[scene] = blocks.block_order(scene, evidence.votes, request.get("block_order", "checked"))
+        found_in = ValidationFrames(root) if request["split"] == "training" else None
+        self.validation = found_in if found_in else None
 
     @property
     def features(self) -> dict[str, Any]:
@@ -108,14 +119,16 @@ def check_claims(dataset: Dataset) -> list[str]:
         Mismatch: Something is not what the source says it should be.
     """
     _check_manifest(dataset)
+    _check_shared(dataset)
     _check_spans(dataset)
     _check_pictures(dataset)
     _check_episodes(dataset)
+    _check_lang(dataset)
     return _check_clip(dataset)
 
 
 def _check_manifest(dataset: Dataset) -> None:
-    """What the manifest says of the source is true: windows, names, block columns, frames of both splits."""
+    """What the manifest says of the source is true: windows, names, block columns."""
     manifest, split = dataset.manifest, dataset.split
     scenes = {
         scene: {"frames": list(split.scenes[scene]), "block_order": list(order)}
@@ -126,17 +139,21 @@ def _check_manifest(dataset: Dataset) -> None:
         ("task_names", manifest["task_names"][: len(TASKS)], list(TASKS)),
         ("scene_names", manifest["scene_names"][: len(SCENE_NAMES)], list(SCENE_NAMES)),
         ("scenes", manifest["scenes"], scenes),
+        ("contradictions", manifest["contradictions"], dataset.contradictions),
     ):
         if told != found:
-            what = f"{told}, {found}" if name == "scenes" else "something else"
+            what = "something else" if "_names" in name or name == "windows" else f"{told}, {found}"
             raise Mismatch(f"{dataset.folder}/{MANIFEST}: {name} are not what {split.folder} says: {what}")
-    if manifest["request"]["split"] == "training":
-        shared = shared_frames(split)
-        if shared and shared != manifest["shared_frames"]:  # none: the source has no validation/ here
-            raise Mismatch(
-                f"{dataset.folder}/{MANIFEST}: training and validation share frames {as_ranges(shared)}, it says "
-                f"{as_ranges(manifest['shared_frames']) or 'none'}"
-            )
+
+
+def _check_shared(dataset: Dataset) -> None:
+    """Frames that are listed as in both splits are; that none is missing in the list shows when they are compared."""
+    if dataset.validation is None:
+        return
+    listed = dataset.manifest["shared_frames"]
+    wrong = [frame for frame in listed if not dataset.validation.hold(dataset.split.frame_file(frame))]
+    if wrong:
+        raise Mismatch(f"{dataset.folder}/{MANIFEST}: frames {as_ranges(wrong)} are not in validation, as it says")
 
 
 def _check_spans(dataset: Dataset) -> None:
@@ -147,14 +164,16 @@ def _check_spans(dataset: Dataset) -> None:
     if request["mode"] == "play":
         wanted = play_spans(split, excluded)
     else:
-        wanted = window_spans(split.windows, request["dedup"], excluded)
+        wanted = window_spans(split.windows, request["dedup"], excluded, split.faults)
+    windows = split.windows
+    faulty = [Span(windows[n].start, windows[n].end, windows[n].scene, (n,)) for n in split.faults]
     left_out = [_span(e) for e in manifest["left_out"]]
     place = f"{dataset.folder}/{MANIFEST}"
     if left_out and not request["skip_bad"]:
         raise Mismatch(f"{place}: {len(left_out)} episodes were left out without --skip_bad=true")
-    listed, known = {*dataset.spans, *left_out}, set(wanted)
+    listed, known = {*dataset.spans, *left_out}, {*wanted, *faulty}
     for what, spans in (
-        ("missing and not listed as left out", [span for span in wanted if span not in listed]),
+        ("missing and not listed as left out", [span for span in (*wanted, *faulty) if span not in listed]),
         ("not asked for", [span for span in (*dataset.spans, *left_out) if span not in known]),
     ):
         if spans:
@@ -165,10 +184,10 @@ def _check_spans(dataset: Dataset) -> None:
 
 
 def _check_files(folder: Path, listed: dict[str, str]) -> None:
-    """The files of data, videos and meta are those that were published: none more, none fewer, none changed."""
+    """The files of data, videos, meta and lang are those that were published: none more, none fewer, none changed."""
     there = {
         path.relative_to(folder).as_posix()
-        for part in ("data", "videos", "meta")
+        for part in ("data", "videos", "meta", EMBEDDINGS)
         for path in (folder / part).rglob("*")
         if path.is_file()
     }
@@ -183,6 +202,18 @@ def _check_hashes(folder: Path, there: set[str], listed: dict[str, str], since: 
     for name, sha in tqdm(listed.items(), desc="hashing", unit="file", leave=False):
         if sha256(folder / name) != sha:
             raise Mismatch(f"{folder / name} was changed since it {since} (SHA-256)")
+
+
+def _check_lang(dataset: Dataset) -> None:
+    """Embeddings of sentences, if they were asked for, are the source's, and belong to these frames."""
+    request = dataset.manifest["request"]
+    if not request.get("lang_embeddings"):
+        return
+    file = dataset.folder / EMBEDDINGS / f"{embeddings_name(request.get('lang_folder', LANG_FOLDER))}.npy"
+    if not np.array_equal(np.load(file), read_embeddings(dataset.split.language, len(dataset.split.windows))):
+        raise Mismatch(f"{file} is not what {dataset.split.language} holds")
+    if json.loads(file.with_suffix(".json").read_text())["fingerprint"] != dataset_fingerprint(dataset.folder):
+        raise Mismatch(f"{file} belongs to other frames")
 
 
 def _check_clip(dataset: Dataset) -> list[str]:

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from dataset_convert.calvin import VECTORS, digest
+from dataset_convert.frames import STATES, VECTORS, digest
 from dataset_convert.verify_claims import Dataset, Mismatch, chunk_and_file
 from lerobot_lansar.calvin import COLORS, CONTROL_HZ, TASKS
 
@@ -33,15 +33,18 @@ class Found:
         frames: How many.
         psnr: Feature to the signal-to-noise ratio (dB) of each picture.
         sums: Feature to (smallest, largest, sum) of each dimension.
+        shared: Numbers of frames of training that are in validation too.
     """
 
     frames: int = 0
     psnr: dict[str, list[float]] = field(default_factory=dict)
     sums: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
+    shared: set[int] = field(default_factory=set)
 
     def add(self, other: "Found") -> None:
         """Takes in what another file holds."""
         self.frames += other.frames
+        self.shared |= other.shared
         for key, values in other.psnr.items():
             self.psnr.setdefault(key, []).extend(values)
         for key, sums in other.sums.items():
@@ -103,6 +106,7 @@ def verify_file(dataset: Dataset, path: Path, min_psnr: float) -> Found:
             group = _with_source(dataset, path, table.read_row_group(number), arrays)
             hashes[group.episode] = digest(group.source, hashes.get(group.episode))
             _compare_columns(dataset, group, found)
+            found.shared |= _in_validation(dataset, group)
             for key in cameras:
                 if key in videos:
                     _compare_video(dataset, group, key, videos[key], min_psnr, found)
@@ -126,6 +130,16 @@ def _with_source(dataset: Dataset, path: Path, rows: pa.Table, arrays: list[str]
     return _RowGroup(rows, dataset.split.read(frames, arrays), episode, first, place)
 
 
+def _in_validation(dataset: Dataset, group: _RowGroup) -> set[int]:
+    """Numbers of the group's source frames that validation holds too."""
+    if dataset.validation is None:
+        return set()
+    states = [{key: group.source[key][row] for key in STATES} for row in range(len(group.rows))]
+    frames = group.rows["calvin.frame"].to_pylist()
+    files = map(dataset.split.frame_file, frames)
+    return {frame for frame, file, s in zip(frames, files, states, strict=True) if dataset.validation.hold(file, s)}
+
+
 # ---- columns of numbers
 
 
@@ -147,10 +161,10 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
     windows = dataset.windows[episode][first : first + n]
     listed = dataset.split.windows
     tasks = np.array([manifest["task_names"].index(listed[w].task) if w >= 0 else -1 for w in windows])
-    action, other = source["rel_actions"], source["actions"]
+    absolute, relative = _without_jumps(source["actions"]), source["rel_actions"]
+    action, other, name = relative, absolute, "calvin.actions"
     if manifest["request"]["action"] == "abs":
-        action, other = source["actions"].copy(), source["rel_actions"]
-        action[:, 3] %= 2 * np.pi
+        action, other, name = absolute, relative, "calvin.rel_actions"
     order = dataset.orders[span.scene]
     blocks = [6 + 6 * order.index(color) + i for color in COLORS for i in range(6)]
     scene = source["scene_obs"][:, [*range(6), *blocks]]
@@ -158,10 +172,10 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
         scene = np.hstack([scene, np.eye(len(TASKS) + 1)[tasks, :-1]])  # task -1 takes the last row: all zeros
     number = {row["task"]: row["task_index"] for row in dataset.tasks}
     return {
-        "observation.state": source["robot_obs"].astype(np.float32),
+        "observation.state": _without_jumps(source["robot_obs"]).astype(np.float32),
         "observation.environment_state": scene.astype(np.float32),
         "action": action.astype(np.float32),
-        "calvin.actions" if other is source["actions"] else "calvin.rel_actions": other.astype(np.float32),
+        name: other.astype(np.float32),
         "calvin.frame": np.arange(span.start + first, span.start + first + n),
         "calvin.window": windows,
         "calvin.task": tasks,
@@ -172,6 +186,16 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
         "index": np.arange(start, start + n),
         "task_index": np.array([number[dataset.sentence_of(window)] for window in windows]),
     }
+
+
+def _without_jumps(poses: np.ndarray) -> np.ndarray:
+    """Poses whose roll, pitch and yaw lie in [0, 2 pi), [-pi, pi) and [-pi/2, 3 pi/2)."""
+    poses = poses.copy()
+    for column, lowest in ((3, 0.0), (4, -np.pi), (5, -np.pi / 2)):
+        for _ in range(100):  # turns; CALVIN's angles need one
+            poses[poses[:, column] < lowest, column] += 2 * np.pi
+            poses[poses[:, column] >= lowest + 2 * np.pi, column] -= 2 * np.pi
+    return poses
 
 
 def _numbers(column: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ statistics and for muxing the growing mp4 again (measured with LeRobot 0.6.1). T
 
 import io
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -219,9 +219,14 @@ class Video:
                 frame = quantize_depth(picture, **depth)
             self.container.mux(self.stream.encode(frame))
 
-    def __exit__(self, *_: object) -> None:
-        self.container.mux(self.stream.encode())
-        self.container.close()
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            if kind is None:
+                self.container.mux(self.stream.encode())
+                self.container.close()
+        finally:
+            with suppress(OSError):  # on a full disk; a container that is not closed prints a traceback when freed
+                self.container.close()
 
 
 def _options(codec: Codec) -> dict[str, str]:

@@ -44,6 +44,9 @@ configuration file, although CALVIN's documentation says red, blue, pink."""
 
 SCENE_NAMES = tuple(BLOCK_ORDER)
 
+SLIDE_TRAVEL = {"A": 0.28, "B": 0.304, "C": 0.24, "D": 0.28}
+"""Scene to the position (m) at which its sliding door stops, fully open; it begins at 0."""
+
 # ---- robot_obs and scene_obs
 
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")

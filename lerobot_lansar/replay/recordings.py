@@ -10,8 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_convert.calvin import VECTORS, CalvinSplit
-from dataset_convert.checks import block_order, block_votes, reorder_blocks
+from dataset_convert.blocks import block_order, block_votes, reorder_blocks
+from dataset_convert.calvin import CalvinSplit
+from dataset_convert.frames import VECTORS
 from dataset_convert.hub import find_dataset
 from dataset_convert.layout import MANIFEST
 

@@ -23,19 +23,33 @@ class FakeCalvin:
         root: The dataset's folder.
         windows: (start, end, task, sentence) of each window.
         frames: Frame number -> what its file holds.
+        split: The split's name.
     """
 
     root: Path
     windows: list[tuple[int, int, str, str]]
     frames: dict[int, dict[str, np.ndarray]]
+    split: str = "training"
+
+    @property
+    def folder(self) -> Path:
+        return self.root / self.split
 
     def file(self, frame: int) -> Path:
-        return self.root / "training" / f"episode_{frame:07d}.npz"
+        return self.folder / f"episode_{frame:07d}.npz"
 
     def rewrite(self, frame: int, **changes: np.ndarray | None) -> None:
         """Writes one frame again with some arrays changed, or dropped if None."""
         content = {**self.frames[frame], **changes}
         np.savez(self.file(frame), **{key: value for key, value in content.items() if value is not None})
+
+
+def without_jumps(pose: np.ndarray) -> np.ndarray:
+    """A state or an absolute action as a dataset holds it: roll in [0, 2 pi), yaw in [-pi/2, 3 pi/2), float32."""
+    pose = pose.copy()
+    pose[3] += 2 * np.pi * (pose[3] < 0)
+    pose[5] += 2 * np.pi * (pose[5] < -np.pi / 2)
+    return pose.astype(np.float32)
 
 
 def write_calvin(
@@ -50,11 +64,13 @@ def write_calvin(
     length: int = 12,
     overlap: int = 0,
     seed: int = 0,
+    split: str = "training",
+    first: int = 100,
 ) -> FakeCalvin:
     """Writes one recording whose windows carry out `tasks` one after the other.
 
     Args:
-        root: Folder to create.
+        root: The dataset's folder.
         rgb: Write pictures too.
         depth, tactile: Write distances, and the fingertip sensors' pictures.
         scene: Letter of the scene.
@@ -63,12 +79,14 @@ def write_calvin(
         length: Frames of a window.
         overlap: Frames that successive windows share.
         seed: Of all random numbers.
+        split: Name of the folder to create in `root`.
+        first: Number of the first frame.
     """
     rng = np.random.default_rng(seed)
     order = block_order or BLOCK_ORDER[scene]
-    folder = root / "training"
+    folder = root / split
     (folder / "lang_annotations").mkdir(parents=True)
-    first, step = 100, length - overlap
+    step = length - overlap
     total = step * len(tasks) + overlap
     time = np.arange(total)
     robot_obs = rng.normal(size=15) * 0.3 + 0.01 * np.cumsum(rng.normal(size=(total, 15)), axis=0)
@@ -122,4 +140,4 @@ def write_calvin(
         "info": {"indx": [(start, end) for start, end, *_ in windows], "episodes": []},
     }
     np.save(folder / "lang_annotations" / "auto_lang_ann.npy", annotations, allow_pickle=True)
-    return FakeCalvin(root, windows, frames)
+    return FakeCalvin(root, windows, frames, split)

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_calvin import COMMANDS, write_calvin
+from fake_calvin import COMMANDS, without_jumps, write_calvin
 
 from dataset_convert import convert
 from dataset_convert.calvin import CalvinSplit
@@ -50,8 +50,8 @@ def test_every_item_is_the_source_frame_with_its_command(tmp_path):
             assert (item["episode_index"].item(), item["frame_index"].item()) == (episode, offset)
             assert item["timestamp"].item() == pytest.approx(offset / 30, abs=1e-6)
             np.testing.assert_array_equal(item["action"], source["rel_actions"].astype(np.float32))
-            np.testing.assert_array_equal(item["calvin.actions"], source["actions"].astype(np.float32))
-            np.testing.assert_array_equal(item["observation.state"], source["robot_obs"].astype(np.float32))
+            np.testing.assert_array_equal(item["calvin.actions"], without_jumps(source["actions"]))
+            np.testing.assert_array_equal(item["observation.state"], without_jumps(source["robot_obs"]))
             stored = item["observation.environment_state"].numpy()
             blocks = dict(zip(("pink", "blue", "red"), source["scene_obs"][6:].reshape(3, 6), strict=True))
             expected = np.concatenate([source["scene_obs"][:6], *(blocks[color] for color in COLORS)])
@@ -61,19 +61,27 @@ def test_every_item_is_the_source_frame_with_its_command(tmp_path):
 
 def test_absolute_actions_on_request(calvin, tmp_path):
     dataset = load(convert.convert(options(calvin, tmp_path / "out", action="abs")))
-    rolls = []
-    for index in range(dataset.num_frames):
-        item = dataset[index]
-        source, action = calvin.frames[item["calvin.frame"].item()], item["action"].numpy().copy()
+    for item in dataset:
+        source = calvin.frames[item["calvin.frame"].item()]
         np.testing.assert_array_equal(item["calvin.rel_actions"], source["rel_actions"].astype(np.float32))
-        rolls.append([source["actions"][3], action[3]])
-        action[3] = source["actions"][3]
-        np.testing.assert_array_equal(action, source["actions"].astype(np.float32))
-    recorded, stored = np.array(rolls).T
-    assert np.ptp(recorded) > 6  # the recording jumps, the dataset does not
-    assert np.abs(stored - np.pi).max() < 0.1
-    np.testing.assert_allclose(np.exp(1j * stored), np.exp(1j * recorded), atol=1e-6)
+        np.testing.assert_array_equal(item["action"], without_jumps(source["actions"]))
     assert dataset.meta.features["action"]["names"] == ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+
+
+def test_lerobots_relative_actions_do_not_jump_where_calvins_roll_does(calvin, tmp_path):
+    import torch
+    from lerobot.processor import RelativeActionsProcessorStep, TransitionKey
+
+    dataset = load(convert.convert(options(calvin, tmp_path / "out", action="abs")))
+    rows = dataset.hf_dataset.with_format("numpy")[:]
+    step = RelativeActionsProcessorStep(enabled=True)
+    state, action = torch.from_numpy(rows["observation.state"]), torch.from_numpy(rows["action"])
+    done = step({TransitionKey.OBSERVATION: {"observation.state": state}, TransitionKey.ACTION: action})
+    recorded = np.array([[content["robot_obs"][3], content["actions"][3]] for content in calvin.frames.values()])
+    assert np.ptp(recorded, axis=0).min() > 6, "the recorded rolls of states and of actions jump"
+    assert np.abs(np.diff(recorded)).max() > 6, "and lie on different sides"
+    assert np.ptp(state[:, 3].numpy()) < 0.1
+    assert done[TransitionKey.ACTION][:, 3].abs().max() < 0.1
 
 
 def test_the_commanded_task_is_told_in_the_state_on_request(calvin, tmp_path):

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from fake_calvin import write_calvin
 
-from dataset_convert import checks, plan, verify
+from dataset_convert import blocks, plan, verify
 from dataset_convert.convert import convert
 from dataset_convert.episodes import Span
 from dataset_convert.options import ConvertConfig
@@ -333,7 +333,7 @@ def test_a_recording_that_the_converter_drops_is_found(calvin, defective):
 
 
 def test_blocks_that_the_converter_takes_for_others_are_found(calvin, defective):
-    out = defective(checks, "block_order", lambda *_: ("blue", "red", "pink"))
+    out = defective(blocks, "block_order", lambda *_: ("blue", "red", "pink"))
     with pytest.raises(Mismatch, match=r"scenes are not what .*'blue', 'red', 'pink'.*'red', 'blue', 'pink'"):
         verify.verify(VerifyConfig("me/desk", calvin.root, out))
     path = out / "meta/calvin_source.json"
@@ -363,9 +363,21 @@ def test_frames_of_both_splits_are_those_of_the_source(calvin, tmp_path):
     out = convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none", exclude_shared=True))
     config = VerifyConfig("me/desk", calvin.root, out)
     assert "3 episodes, 36 frames equal" in verify.verify(config)
-    shutil.copy(calvin.file(113), calvin.root / "validation")
-    with pytest.raises(Mismatch, match="training and validation share frames 105, 113, it says 105"):
+    shutil.copy(calvin.file(113), calvin.root / "validation/episode_0000007.npz")
+    with pytest.raises(Mismatch, match="training and validation share frames 113, which are here and should be left"):
         verify.verify(config)
+    (calvin.root / "validation/episode_0000105.npz").unlink()
+    with pytest.raises(Mismatch, match="frames 105 are not in validation, as it says"):
+        verify.verify(config)
+
+
+def test_a_dataset_of_an_earlier_version_is_refused(calvin, tmp_path):
+    out = convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none"))
+    change_json(out / "meta/calvin_source.json", lambda m: m["request"].pop("format"))
+    with pytest.raises(ValueError, match=r"format 1, here 2; .*convert again"):
+        verify.verify(VerifyConfig("me/desk", calvin.root, out))
+    with pytest.raises(ValueError, match="another conversion"):
+        convert(ConvertConfig(calvin.root, "me/desk", out, images="none"))
 
 
 def test_another_source_is_refused(copied, tmp_path):
