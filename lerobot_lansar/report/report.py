@@ -27,8 +27,8 @@ class ReportConfig:
     results_dir: Path | None = None
     # Seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000.
     seed: int | None = None
-    # The run's policy (--policy.path), a folder or a name on the hub. With it the report states whether the policy reads
-    # the simulator's own state, and whether it was evaluated in the look of its dataset.
+    # Policy of that run (--policy.path), a folder or a name on the hub. With it, the report states whether the policy
+    # reads the simulator's own state, and whether it was evaluated in the look of its dataset.
     policy_path: str | None = None
 
 
