@@ -1,5 +1,6 @@
 """Work in local processes ends as it should; under Slurm and on Ray it gives the same files."""
 
+import multiprocessing
 import os
 import shutil
 import signal
@@ -118,7 +119,7 @@ def leave_note(folder, shard):
 
 
 def misbehave(folder, how, shard):
-    """Shard 0 leaves its process id and works for ever; shard 1 then ends its process or raises."""
+    """Shard 0 leaves its process id and works for ever; shard 1 ends its process, or raises, at once or once told."""
     note = folder / "process"
     if shard == 0:
         note.write_text(str(os.getpid()))
@@ -127,6 +128,8 @@ def misbehave(folder, how, shard):
         time.sleep(0.01)
     if how == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
+    while how == "raises when told" and not (folder / "told").exists():
+        time.sleep(0.01)
     raise ValueError(f"shard {shard} failed")
 
 
@@ -178,6 +181,22 @@ def test_a_worker_that_dies_or_fails_ends_the_others(how, error, message, main_t
         run_here(*arguments) if main_thread else thread.submit(run_here, *arguments).result()
     assert not (tmp_path / "0").exists(), "the finishing step must not run"
     assert is_gone(int((tmp_path / "process").read_text()))
+
+
+def test_a_worker_that_fails_leaves_processes_of_other_threads_alone(tmp_path):
+    other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    with ThreadPoolExecutor(1) as thread:
+        work = thread.submit(run_here, (misbehave, (tmp_path, "raises when told")), (leave_note, (tmp_path,)))
+        while not (tmp_path / "process").exists():
+            time.sleep(0.01)
+        other.start()
+        (tmp_path / "told").touch()
+        with pytest.raises(ValueError, match="shard 1 failed"):
+            work.result()
+    assert is_gone(int((tmp_path / "process").read_text()))
+    assert other.is_alive()
+    other.kill()
+    other.join()
 
 
 def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_failed(slurm, tmp_path, monkeypatch):

@@ -14,7 +14,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -91,8 +93,7 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
         for shard in range(shards):
             function(*arguments, shard)
         return
-    others = set(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")
+    context = _Context()
     pool = ProcessPoolExecutor(workers, context, initializer=_follow_parent)
     try:
         with _blocked_interrupts():  # the workers start here
@@ -102,8 +103,9 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
             if future.done():
                 future.result()
     except BaseException as error:  # end the other workers too, whatever they are doing
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()
+        for process in context.processes:
+            if process.is_alive():
+                process.terminate()
         if isinstance(error, BrokenProcessPool):
             raise WorkerDied(
                 "a worker process was killed (out of memory?); run the same command again to go on"
@@ -111,6 +113,24 @@ def _run_here(work: Work, shards: int, workers: int) -> None:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+class _Context(SpawnContext):
+    """Starts processes by "spawn" and remembers them: a pool cannot end its own before Python 3.14.
+
+    Attributes:
+        processes: All that were made, in order.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.processes: list[SpawnProcess] = []
+
+    def Process(self, *args: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
+        """Called by the pool."""
+        process = SpawnProcess(*args, **options)
+        self.processes.append(process)
+        return process
 
 
 @contextmanager

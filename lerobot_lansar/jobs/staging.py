@@ -91,5 +91,15 @@ def _claim(folder: Path, target: Path, request: dict[str, Any], has_results: Cal
 
 
 def _remove(paths: Iterator[Path]) -> None:
+    """Removes files and folders; some may vanish meanwhile."""
     for path in list(paths):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if path.is_dir():
+            shutil.rmtree(path, onexc=_accept_missing)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _accept_missing(function: Callable[..., Any], path: str, error: BaseException) -> None:
+    """Called by `shutil.rmtree` for what it cannot remove."""
+    if not isinstance(error, FileNotFoundError):
+        raise error
