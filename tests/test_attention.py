@@ -8,7 +8,7 @@ import torch
 
 import lerobot_policy_lansar  # noqa: F401  (registers environment and policy)
 from lerobot_lansar import attention as attention_module
-from lerobot_lansar.clip.model import ClipConfig
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.processor_lansar import make_lansar_pre_post_processors

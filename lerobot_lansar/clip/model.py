@@ -10,7 +10,6 @@ import functools
 import hashlib
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +18,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from .config import ClipConfig
+
 CLIP_MODELS = Path(__file__).parent / "clip_models"
 """Model configurations in open_clip's format that come with this package; the place for trained weights too."""
-
-
-@dataclass
-class ClipConfig:
-    """Which CLIP."""
-
-    # An open_clip model name (ViT-B-32), or one that comes with this package (lansar-tiny).
-    model: str = "ViT-B-32"
-    # An open_clip tag (openai), a local weights file, or nothing for random weights from a fixed seed.
-    pretrained: str = "openai"
 
 
 @functools.cache

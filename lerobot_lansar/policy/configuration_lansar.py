@@ -7,7 +7,8 @@ from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim import AdamWConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from ..clip.model import ClipConfig, embedding_size
+from ..clip.config import ClipConfig
+from ..clip.model import embedding_size
 from .network import NetworkConfig
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, encoded_sizes
 from .scheduler import LinearWarmupDecaySchedulerConfig

@@ -39,7 +39,8 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from ..clip.model import Clip, ClipConfig, weights_are_public
+from ..clip.config import ClipConfig
+from ..clip.model import Clip, weights_are_public
 from ..clip.store import IMAGE_FEATURES
 from .configuration_lansar import LanSARConfig
 from .windows import Windows, get_current

@@ -33,7 +33,7 @@ SMALL = {
 
 def small_config(**options):
     """A LanSARConfig small enough for tests, with lansar-tiny untrained."""
-    from lerobot_lansar.clip.model import ClipConfig
+    from lerobot_lansar.clip.config import ClipConfig
     from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 
     return LanSARConfig(**{**SMALL, "clip": ClipConfig("lansar-tiny", ""), **options})

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from lerobot_lansar.clip.model import ClipConfig
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.policy.network import (
     Attention,
     BatchNorm,

@@ -13,7 +13,7 @@ import torch
 import yaml
 from lerobot.configs.policies import PreTrainedConfig
 
-from lerobot_lansar.clip.model import ClipConfig
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from lerobot_lansar.calvin import wrap_angle
-from lerobot_lansar.clip.model import Clip, ClipConfig
+from lerobot_lansar.clip.config import ClipConfig
+from lerobot_lansar.clip.model import Clip
 from lerobot_lansar.clip.store import dataset_fingerprint
 from lerobot_lansar.policy import frames as frames_module
 from lerobot_lansar.policy.frames import CACHE, load_frames
