@@ -150,7 +150,10 @@ class View:
         return bool(self.block(color)[2] < FALLEN)
 
     def lies_on(self, upper: str, lower: str, height: float = np.inf) -> bool:
-        """Whether a block's centre is above another's: by 0.03 m to `height` (m), and less than 0.05 m to the side."""
+        """Whether a block's centre is above another's: by 0.03 m to `height` (m), and less than 0.05 m to the side.
+
+        A height of 0.07 admits the block directly on top, however both lie; 0.09 admits the one on that block too.
+        """
         way = self.block(upper)[:3] - self.block(lower)[:3]
         return bool(0.03 < way[2] < height and np.linalg.norm(way[:2]) < 0.05)
 

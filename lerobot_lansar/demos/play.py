@@ -8,8 +8,8 @@ import numpy as np
 from ..calvin import CHAIN_LENGTH, COLORS, GRIPPER_ACTION, STEPS_PER_COMMAND, SWITCH, TASKS, WINDOW_FRAMES, Task
 from ..desk import Desk, SimulationError, completed_tasks, is_fulfilled
 from ..desk.desk import Observation
-from ..desk.oracle import DRAWER, PLANK, TABLE, Snapshot, is_stacked
-from ..desk.scenes import DRAWER_TRAVEL, REACH, SWITCH_TRAVEL, TABLE_Z, Scene, beside_door
+from ..desk.oracle import DRAWER, PLANK, TABLE, Snapshot, has_stack
+from ..desk.scenes import DRAWER_TRAVEL, REACH, SWITCH_TRAVEL, TABLE_Z, Scene, beside_door, can_be_pushed
 from ..desk.starts import sample_start
 from .calvin_folder import FrameWriter, Unit
 from .demonstrator import AFTERWARDS, Frame, carry_out
@@ -185,15 +185,15 @@ def _is_feasible(task: Task, view: View, snapshot: Snapshot) -> bool:
         case "turn_off_led":
             return snapshot.led
         case "unstack_block":
-            return any(is_stacked(block) for block in snapshot.blocks.values())
+            return has_stack(snapshot)
         case "push_into_drawer":
             near = [color for color in COLORS if abs(view.block(color)[0] - view.scene.drawer_x) < 0.3]
             return view.drawer > 0.15 and any(_free_on_table(color, view, snapshot) for color in near)
         case "rotate_block":
             return _free_on_table(str(task.color), view, snapshot)
         case "push_block":
-            end = view.block(str(task.color))[0] + (0.11 if task.side == "right" else -0.11)
-            return _free_on_table(str(task.color), view, snapshot) and bool(abs(end) < REACH)
+            color = str(task.color)
+            return _free_on_table(color, view, snapshot) and can_be_pushed(task.side, view.block(color)[0])
         case "lift_block":
             return _can_be_lifted(str(task.color), str(task.place), view, snapshot)
     return False

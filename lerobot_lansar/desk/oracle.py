@@ -125,6 +125,11 @@ def is_stacked(block: BlockState) -> bool:
     return bool(block.bodies) and block.bodies <= set(COLORS) and block.resting
 
 
+def has_stack(snapshot: Snapshot) -> bool:
+    """Whether any block is stacked."""
+    return any(is_stacked(block) for block in snapshot.blocks.values())
+
+
 def _touches_block(block: BlockState) -> bool:
     return bool(block.bodies & set(COLORS))
 

@@ -163,6 +163,11 @@ EVALUATION_LAYOUT: dict[str, tuple[float, ...]] = {
 """Where calvin_env's evaluation configuration of scene D puts the blocks (m, rad); blue falls on red."""
 
 
+def can_be_pushed(side: str | None, x: float) -> bool:
+    """Whether a block at `x` still lies on the table after a push of 0.11 m to a side, "right" (+x) or "left"."""
+    return bool(abs(x + (0.11 if side == "right" else -0.11)) <= REACH)
+
+
 def beside_door(scene: Scene, slide: float, x: float) -> bool:
     """Whether a finger, 0.045 m from the block's middle, fits between the door's edge and a block at `x` behind it."""
     door = scene.slide_x - slide

@@ -7,18 +7,18 @@ import numpy as np
 from ..calvin import BULB, COLORS, DRAWER, LED, SLIDE, SWITCH, TASKS, Task, block_pose
 from .desk import Desk
 from .errors import DeskError
-from .oracle import SURFACES, TABLE, is_stacked
+from .oracle import SURFACES, TABLE, has_stack
 from .scenes import (
     BLOCK_LENGTHS,
     BLOCK_SIDE,
     BUTTON_Y,
     DRAWER_TRAVEL,
     DRAWER_Z,
-    REACH,
     SWITCH_TRAVEL,
     TABLE_Z,
     Scene,
     beside_door,
+    can_be_pushed,
 )
 
 _CLEARANCE = 0.10  # between block centres (m): no two blocks touch, and a hand fits between most of them
@@ -91,13 +91,13 @@ def _is_feasible(desk: Desk, task: Task, held: str | None, chosen: np.ndarray, s
         return False
     if task.color is not None:
         x = settled[block_pose(COLORS.index(task.color))][0]
-        if task.kind == "push_block" and abs(x + (0.11 if task.side == "right" else -0.11)) > REACH:
+        if task.kind == "push_block" and not can_be_pushed(task.side, x):
             return False
         if task.place == "slider" and not beside_door(desk.scene, settled[SLIDE], x):
             return False
         return snapshot.blocks[task.color].contacts == {SURFACES.get(task.place, TABLE)}
     if task.kind == "unstack_block":
-        return any(is_stacked(block) for block in snapshot.blocks.values())
+        return has_stack(snapshot)
     compared = [SLIDE, DRAWER, SWITCH, BULB, LED]  # not the button, which may still be moving
     return bool(np.allclose(settled[compared], chosen[compared], atol=5e-3))
 
