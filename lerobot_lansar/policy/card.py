@@ -19,10 +19,10 @@ It predicts the gripper's next motion from the last {window} steps at most.
 
 ## Use
 
-[LeRobot](https://github.com/huggingface/lerobot) finds this policy and the desk only if their plugin is installed:
+[LeRobot](https://github.com/huggingface/lerobot) finds this policy and the desk only if their plugin is installed, the
+distribution `lerobot_policy_lansar`: see its installation page.
 
 ```bash
-pip install lerobot_policy_lansar
 lerobot-eval --policy.path={repo_id} --env.type=calvin --env.control_mode={control_mode}{cameras} \\
     --eval.n_episodes=1000 --eval.batch_size=10 --seed=0
 ```

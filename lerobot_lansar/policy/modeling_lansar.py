@@ -101,7 +101,13 @@ class LanSARPolicy(PreTrainedPolicy):
         self.reset()
 
     def _check_pretrained(self) -> None:
-        """Rejects options that pretrained weights were not made for, which LeRobot reports as shapes or not at all."""
+        """Rejects options that pretrained weights were not trained with.
+
+        Some would change silently what the weights mean; others would fail later, with a message about shapes.
+
+        Raises:
+            ValueError: An option of `TRAINED_OPTIONS` is not that of the checkpoint.
+        """
         if not self.config.pretrained_path:
             return
         trained = PreTrainedConfig.from_pretrained(

@@ -8,11 +8,10 @@ import pytest
 import torch
 import yaml
 
-from lerobot_lansar.calvin import continuous_euler
+from lerobot_lansar.calvin import COLORS, continuous_euler
 
 from .conftest import CONFIGS, dataset_meta, small_config
 
-COLOURS = ("red", "blue", "pink")
 REACH = 0.012  # m, where the teacher closes the gripper
 
 
@@ -27,7 +26,7 @@ def start(rng):
 
 
 def block(environment, colour):
-    return environment[6:].reshape(3, 6)[COLOURS.index(colour), :3]
+    return environment[6:].reshape(3, 6)[COLORS.index(colour), :3]
 
 
 def move(state, target):
@@ -57,10 +56,10 @@ def record(root, episodes):
     for i in range(episodes):
         state, environment = start(rng)
         for _ in range(20):
-            action = teach(state, environment, COLOURS[i % 3])
+            action = teach(state, environment, COLORS[i % 3])
             values = (state, environment, action)
             frame = {k: v.astype(np.float32) for k, v in zip(sizes, values, strict=True)}
-            dataset.add_frame({**frame, "task": f"reach for the {COLOURS[i % 3]} block"})
+            dataset.add_frame({**frame, "task": f"reach for the {COLORS[i % 3]} block"})
             action[:3] += rng.normal(0, 0.004, 3)  # what is done differs from what is recorded, as on the desk
             state = move(state, action)
         dataset.save_episode()
@@ -102,11 +101,11 @@ def test_the_policy_learns_to_reach_for_the_block_the_command_names(tmp_path):
     config.input_features, config.output_features = {}, {}
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(tmp_path / "data")).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
-    tasks = [f"reach for the {COLOURS[i // 20 % 3]} block" for i in range(30 * 20)]
+    tasks = [f"reach for the {COLORS[i // 20 % 3]} block" for i in range(30 * 20)]
     train(policy, preprocess, tasks, updates=150, batch_size=24)
 
     rng = np.random.default_rng(1)
-    colours = [COLOURS[i % 3] for i in range(12)]
+    colours = [COLORS[i % 3] for i in range(12)]
     states, environments = map(list, zip(*(start(rng) for _ in colours), strict=True))
     for _ in range(30):
         batch = {
@@ -116,9 +115,9 @@ def test_the_policy_learns_to_reach_for_the_block_the_command_names(tmp_path):
         }
         actions = policy.select_action(preprocess(batch)).numpy()
         states = [move(state, action) for state, action in zip(states, actions, strict=True)]
-    where = [[block(environment, colour) for colour in COLOURS] for environment in environments]
+    where = [[block(environment, colour) for colour in COLORS] for environment in environments]
     distances = np.linalg.norm(np.array(where) - np.array(states)[:, None, :3], axis=-1)  # (12, colour)
-    named = [COLOURS.index(colour) for colour in colours]
+    named = [COLORS.index(colour) for colour in colours]
     assert np.median(distances[range(12), named]) < 0.04
     assert (distances.argmin(axis=1) == named).sum() >= 9
     assert sum(state[14] < 0 for state in states) >= 6  # and closed the gripper there

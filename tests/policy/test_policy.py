@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from huggingface_hub import ModelCard
 from torch import nn
 
-from lerobot_lansar.clip.model import Clip, ClipConfig, embedding_size
+from lerobot_lansar.clip.config import ClipConfig
+from lerobot_lansar.clip.model import Clip, embedding_size
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.processor_lansar import ClipStep, make_lansar_pre_post_processors
@@ -442,7 +443,7 @@ def test_the_model_card_says_what_the_policy_is_and_how_to_evaluate_it(spatial, 
     assert {"calvin", "lerobot_policy_lansar", "robotics", "lansar"} <= set(card.data.tags)
     assert card.data.datasets == "me/desk"
     for text in (
-        "pip install lerobot_policy_lansar",
+        "the\ndistribution `lerobot_policy_lansar`",
         "lerobot-eval --policy.path=me/lansar --env.type=calvin",
         "https://huggingface.co/datasets/me/desk",
         "| updates | 7 |",
