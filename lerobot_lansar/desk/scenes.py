@@ -6,7 +6,7 @@ of furniture with its parts in different places, so a scene is a handful of numb
 
 from dataclasses import dataclass, replace
 
-from ..calvin import BLOCK_ORDER
+from ..calvin import BLOCK_ORDER, SLIDE_TRAVEL
 from .errors import DeskError
 
 BLOCK_LENGTHS = {"small": 0.04, "middle": 0.056, "big": 0.08}
@@ -99,7 +99,7 @@ SCENES = {
         slide_x=-0.10,
         drawer_x=0.10,
         cabinet=(-0.36, 0.16),
-        slide_travel=0.28,
+        slide_travel=SLIDE_TRAVEL["A"],
         wood=(0.46, 0.27, 0.19),
         dark_wood=(0.36, 0.20, 0.14),
         metal=(0.36, 0.37, 0.40),
@@ -115,7 +115,7 @@ SCENES = {
         slide_x=0.088,
         drawer_x=0.18,
         cabinet=(-0.18, 0.34),
-        slide_travel=0.304,
+        slide_travel=SLIDE_TRAVEL["B"],
         wood=(0.87, 0.78, 0.62),
         dark_wood=(0.78, 0.67, 0.50),
         metal=(0.45, 0.46, 0.48),
@@ -131,7 +131,7 @@ SCENES = {
         slide_x=0.06,
         drawer_x=0.10,
         cabinet=(-0.18, 0.34),
-        slide_travel=0.24,
+        slide_travel=SLIDE_TRAVEL["C"],
         wood=(0.66, 0.50, 0.27),
         dark_wood=(0.49, 0.37, 0.21),
         metal=(0.25, 0.26, 0.28),
@@ -147,7 +147,7 @@ SCENES = {
         slide_x=-0.10,
         drawer_x=0.18,
         cabinet=(-0.36, 0.16),
-        slide_travel=0.28,
+        slide_travel=SLIDE_TRAVEL["D"],
         wood=(0.62, 0.44, 0.27),
         dark_wood=(0.50, 0.33, 0.19),
         metal=(0.33, 0.34, 0.36),
