@@ -1,4 +1,4 @@
-"""Rooms lie on floors: imports point downwards only, and never run in a circle.
+"""Rooms lie on five floors: imports point downwards only, and never run in a circle.
 
 Imports are read from the source, also those inside functions; imports for type checkers do not count.
 """
@@ -37,7 +37,7 @@ FLOORS = [
         "scripts",
     ),
 ]
-"""From the ground up. Rooms of one floor do not import each other, except on the ground and at the top."""
+"""Five floors from the ground up. Rooms of one floor do not import each other, except on the ground and at the top."""
 
 
 def modules():

@@ -94,8 +94,8 @@ class CalvinEnv(gym.Env):
             `lerobot_lansar.pictures` says how they are brought to that size.
         render_size: Width and height of what `render` returns; 0: the camera's own.
         task_in_state: Whether `environment_state` also holds a number for each of the 34 tasks: 1 for the one that is
-            commanded, 0 for the others. For policies that read no language (ACT, Diffusion, VQ-BeT), trained on
-            what `lansar-convert --task_in_state=true` makes.
+            commanded, 0 for the others. For policies that read no language (ACT, Diffusion), trained on what
+            `lansar-convert --task_in_state=true` makes.
         render_mode: `"rgb_array"`: the static camera's picture.
 
     Version: v0.
