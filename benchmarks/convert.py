@@ -27,7 +27,7 @@ from dataset_convert.safe_pickle import load_object_array
 from lerobot_lansar.calvin import CONTROL_HZ, TASKS
 
 OURS = RGBEncoder()
-LEROBOTS = RGBEncoder(vcodec="libsvtav1", crf=30, preset="12")
+LEROBOTS = RGBEncoder(vcodec="libsvtav1", crf=30, preset="12", pix_fmt="yuv420p")
 ABCD_FRAMES = 2_400_000
 CORES = 32
 
@@ -70,7 +70,9 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
     split = CalvinSplit(root, "training")
     pictures = pictures_of(images, depth=False, tactile=False, encoder=encoder)
     features = {k: v for k, v in dataset_features("rel", pictures).items() if k not in DEFAULT_FEATURES}
-    codec = {"rgb_encoder": RGBEncoderConfig(**asdict(encoder))} if images == "video" else {}
+    pix_fmt = "yuv444p" if encoder.pix_fmt == "auto" else encoder.pix_fmt
+    settings = RGBEncoderConfig(**{**asdict(encoder), "pix_fmt": pix_fmt})
+    codec = {"rgb_encoder": settings} if images == "video" else {}
     frames, started = 0, time.perf_counter()
     dataset = LeRobotDataset.create(
         "benchmark/desk",

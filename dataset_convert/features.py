@@ -4,6 +4,7 @@ Imports LeRobot, which takes seconds: `plan` and `finish`, which run once, use t
 """
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +64,14 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
 
 
 def _rgb_config(encoder: RGBEncoder) -> RGBEncoderConfig:
+    pix_fmt = encoder.pix_fmt
+    if pix_fmt == "auto":
+        pix_fmt = "yuv444p" if encoder.vcodec in ("h264", "hevc") else "yuv420p"
     try:
-        return RGBEncoderConfig(vcodec=encoder.vcodec, crf=encoder.crf, preset=encoder.preset or None, g=encoder.g)
+        return RGBEncoderConfig(**{**asdict(encoder), "preset": encoder.preset or None, "pix_fmt": pix_fmt})
     except (ValueError, RuntimeError) as error:
-        raise ValueError(f"--rgb_encoder.vcodec={encoder.vcodec}: {error}") from error
+        named = f"--rgb_encoder.vcodec={encoder.vcodec} --rgb_encoder.pix_fmt={pix_fmt}"
+        raise ValueError(f"{named}: {error}") from error
 
 
 def _rgb_codec(encoder: RGBEncoder) -> Codec:

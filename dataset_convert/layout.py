@@ -27,6 +27,9 @@ class RGBEncoder:
     preset: str = "veryfast"
     # Frames from one key frame to the next; 2 lets training jump to any frame.
     g: int = 2
+    # Pixel format: yuv444p keeps each pixel's colour, yuv420p that of four pixels together. auto: yuv444p with h264 and
+    # hevc, otherwise yuv420p.
+    pix_fmt: str = "auto"
 
 
 @dataclass(frozen=True)

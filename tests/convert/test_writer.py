@@ -14,7 +14,7 @@ from dataset_convert.writer import Video
 rng, size = np.random.default_rng(0), 84
 waves = 50 * np.add.outer(np.sin(np.arange(200) / 7), np.cos(np.arange(200) / 9)) + 120
 pictures = [waves[i : i + size, 2 * i : 2 * i + size, None] + rng.normal(0, 6, (size, size, 3)) for i in range(12)]
-codec = Codec("h264", "yuv420p", {"g": "2", "crf": "18", "preset": "veryfast"})
+codec = Codec("h264", "yuv444p", {"g": "2", "crf": "18", "preset": "veryfast"})
 with Video(Path(sys.argv[1]), Picture("camera", "rgb_gripper", slice(None), (size, size, 3), codec)) as video:
     video.add(np.clip(pictures, 0, 255).astype(np.uint8))
 """
