@@ -25,6 +25,7 @@ from dataset_convert.features import dataset_features, pictures_of
 from dataset_convert.layout import RGBEncoder
 from dataset_convert.safe_pickle import load_object_array
 from lerobot_lansar.calvin import CONTROL_HZ, TASKS
+from lerobot_lansar.cameras import gripper_camera_pose
 
 OURS = RGBEncoder()
 LEROBOTS = RGBEncoder(vcodec="libsvtav1", crf=30, preset="12", pix_fmt="yuv420p")
@@ -89,6 +90,7 @@ def loop(root: Path, episodes: int, encoder: RGBEncoder, images: str, target: Pa
             with np.load(split.frame_file(frame)) as content:
                 item = {
                     "observation.state": content["robot_obs"].astype(np.float32),
+                    "calvin.gripper_camera_pose": gripper_camera_pose(content["robot_obs"]).reshape(16).astype("f4"),
                     "observation.environment_state": content["scene_obs"].astype(np.float32),
                     "action": content["rel_actions"].astype(np.float32),
                     "calvin.actions": content["actions"].astype(np.float32),

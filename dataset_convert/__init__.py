@@ -16,6 +16,8 @@ blocks          the order of the blocks, and what speaks against it
 checks          what must hold of the frames: finite numbers, consistent actions
 shards          converts one shard: find the bad episodes, write the others, note
 writer          writes a shard's frame table and videos
+look            what drew the source's pictures
+poses           where the cameras are
 layout          how the files lie on disk: features of cameras, paths, the manifest's name
 stats           statistics of an episode, as LeRobot keeps them
 features        what LeRobot is told of the dataset; the only one of these that imports LeRobot
@@ -29,5 +31,6 @@ embed           lansar-embed: CLIP embeddings beside it
 verify          lansar-verify: compares it with its source
 verify_claims   what the dataset says of itself
 verify_frames   its frames
+verify_cameras  where its cameras must be
 verify_shared   its frames that are in validation too
 """

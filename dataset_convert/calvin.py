@@ -6,6 +6,7 @@ Layout of a split (`training/` or `validation/`), of the public data and of `lan
     ep_start_end_ids.npy               (N, 2) first and last frame of each uninterrupted recording
     scene_info.npy                     pickled {scene name: [first frame, last frame]}; public data: in training/ only
     lang_annotations/auto_lang_ann.npy pickled {"language": {"ann", "task", "emb"}, "info": {"indx"}}
+    .hydra/merged_config.yaml          how it was recorded
 
 A language window is `[start, end)`: its end is exclusive. Recordings and scenes include their last frame.
 """
@@ -18,6 +19,7 @@ import numpy as np
 
 from dataset_convert.frames import frame_file, frame_numbers, read_frame
 from dataset_convert.language import LANG_FOLDER, find_faults, language_file, read_windows
+from dataset_convert.look import read_look
 from dataset_convert.safe_pickle import parse_npy, read_index_file
 from dataset_convert.scenes import find_scenes
 
@@ -42,6 +44,7 @@ class CalvinSplit:
         windows: The annotated windows in the file's order.
         faults: Numbers of the windows that cannot become an episode, and why not.
         recordings: (N, 2) first and last frame of each uninterrupted recording, in order.
+        look: What drew the pictures, and their size.
         source_sha256: Hash of the index files, which identifies what was converted.
 
     Raises:
@@ -60,6 +63,7 @@ class CalvinSplit:
                 f"{self.folder} is not a folder: --root must hold --split={split}"
                 + (f" (splits found: {', '.join(found)})" if found else " with CALVIN's files")
             )
+        self.look = read_look(self.folder)
         index = self.folder / "ep_start_end_ids.npy"
         self.recordings = _read_recordings(index)
         scenes = find_scenes(self.folder, self.recordings, scene)
@@ -103,7 +107,7 @@ class CalvinSplit:
         """
         columns: dict[str, list[np.ndarray]] = {key: [] for key in keys}
         for frame in frames:
-            for key, array in read_frame(self.frame_file(frame), columns).items():
+            for key, array in read_frame(self.frame_file(frame), columns, self.look.image_size).items():
                 columns[key].append(array)
         return {key: np.stack(column) for key, column in columns.items()}
 

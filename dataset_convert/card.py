@@ -9,7 +9,8 @@ import numpy as np
 
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name
 from dataset_convert.layout import MANIFEST
-from lerobot_lansar.calvin import COLORS
+from dataset_convert.poses import GRIPPER_POSE
+from lerobot_lansar.calvin import CAMERAS, COLORS
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
@@ -28,6 +29,9 @@ _MEANING = {
     "observation.images.gripper": "camera in the hand",
     "observation.images.static_depth": "distances (m) of the fixed camera",
     "observation.images.gripper_depth": "distances (m) of the camera in the hand",
+    GRIPPER_POSE: "4×4 pose of the camera in the hand, camera to world (m)",
+    **{f"observation.camera_pose.{camera}": "4×4 pose, camera to world (m)" for camera in CAMERAS},
+    **{f"observation.camera_intrinsics.{camera}": "3×3 intrinsics (pixels)" for camera in CAMERAS},
 }
 
 
@@ -102,8 +106,8 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
   that the arm reaches jumps. CALVIN's own roll jumps between π and −π, where a hand that points down has it.
 * **Windows** end before their last number, as in CALVIN.{_windows(manifest, used)}
 * **Scenes:** {scenes}; known from {manifest["scenes_from"]}. Blocks are always red, blue, pink here.
-* **Privileged state:** `observation.environment_state` is the simulator's own state (block poses, joints,
-  lights). A real robot does not have it; results of policies that read it must say so.
+{_look(manifest)}* **Privileged state:** `observation.environment_state` is the simulator's own state (block poses,
+  joints, lights). A real robot does not have it; results of policies that read it must say so.
 {_clip(clip)}{_lang(request)}
 | task | windows |
 | --- | ---: |
@@ -132,6 +136,22 @@ def _features(info: dict[str, Any], action: str) -> str:
             text += "; then 1 for the commanded task, 0 for the others (`names` of `meta/info.json`)"
         rows.append(f"| `{key}` | {shape} | {feature['dtype']} | {text} |")
     return "\n".join(rows)
+
+
+def _look(manifest: dict[str, Any]) -> str:
+    """The look of the pictures, and where the cameras are."""
+    look, cameras = manifest["look"], manifest["cameras"]
+    if not cameras:
+        return ""
+    drawn = f"renderer `{look['renderer'] or 'unknown'}`, {look['assets'] or 'unknown'} assets"
+    if (look["renderer"], look["assets"]) == ("gl", "original"):
+        drawn += ", as in CALVIN's public data"
+    size = f", both cameras brought to {look['image_size']} pixels" if look["image_size"] else ""
+    return f"""* **Pictures:** {drawn}{size}. Evaluate in the same look (`--env.renderer`, `--env.assets`,
+  `--env.image_size`).
+* **Cameras:** intrinsics of both and the static camera's pose are in `cameras` of `{MANIFEST}`, the gripper camera's
+  pose in `{GRIPPER_POSE}`. The convention is OpenCV's (x right, y down, z forward; camera to world, m; row by row).
+"""
 
 
 def _windows(manifest: dict[str, Any], used: list[dict[str, Any]]) -> str:
@@ -219,9 +239,13 @@ def _lang(request: dict[str, Any]) -> str:
 
 
 def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
+    size = f" --env.image_size={request['image_size']}" if request.get("image_size") else ""
     if request.get("task_in_state"):  # for policies that read no language; LanSAR refuses such a dataset
-        cameras = " --env.cameras='[]'" if request["images"] == "none" else ""
-        return f"""    lerobot-train --policy.type=act --policy.push_to_hub=false \\
+        cameras = " --env.cameras='[]'" if request["images"] == "none" else size
+        cameras += " --env.depth=true" if request["depth"] else ""
+        cameras += " --env.camera_poses=true" if request.get("camera_poses") else ""
+        act = "act_depth" if request["depth"] else "act"
+        return f"""    lerobot-train --policy.type={act} --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
         --env.control_mode={request["action"]} --env.task_in_state=true{cameras}"""
@@ -234,7 +258,7 @@ this dataset; convert with `--mode=windows` for it."""
     train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
     if clip is not None:
         train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"
-        evaluate = ""
+        evaluate = size
     return f"""    lerobot-train --policy.type=lansar{train} --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\

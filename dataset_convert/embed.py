@@ -21,6 +21,7 @@ from dataset_convert.hub import find_dataset
 from dataset_convert.layout import MANIFEST
 from lerobot_lansar.clip.store import IMAGE_FEATURES, EmbeddingWriter, clip_dir, dataset_fingerprint
 from lerobot_lansar.command import run_command
+from lerobot_lansar.pictures import resize
 
 if TYPE_CHECKING:
     from lerobot_lansar.clip.model import Clip
@@ -76,7 +77,7 @@ class Pictures(Protocol):
 
 
 class SourcePictures:
-    """The pictures of the CALVIN folder; a frame that is in several windows occurs once.
+    """The pictures of the CALVIN folder, at the dataset's size; a frame that is in several windows occurs once.
 
     Args:
         split: Where they are.
@@ -86,7 +87,8 @@ class SourcePictures:
     name = "source"
 
     def __init__(self, split: CalvinSplit, root: Path):
-        episodes = json.loads((root / MANIFEST).read_text())["episodes"]
+        manifest = json.loads((root / MANIFEST).read_text())
+        episodes, self._size = manifest["episodes"], manifest["look"]["image_size"]
         frames = np.concatenate([np.arange(episode["start"], episode["end"]) for episode in episodes])
         self.split = split
         self.frames, first = np.unique(frames, return_inverse=True)
@@ -98,7 +100,8 @@ class SourcePictures:
 
     def __getitem__(self, item: int) -> dict[str, Any]:
         read = self.split.read([int(self.frames[item])], ARRAYS.values())
-        return {key: read[array][0] for key, array in ARRAYS.items()}
+        pictures = {key: read[array][0] for key, array in ARRAYS.items()}
+        return {key: resize(picture, self._size or len(picture)) for key, picture in pictures.items()}
 
 
 class DatasetPictures:

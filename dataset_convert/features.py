@@ -3,6 +3,7 @@
 Imports LeRobot, which takes seconds: `plan` and `finish`, which run once, use this; workers do not.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +19,9 @@ from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, Datase
 from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from dataset_convert.frames import DEPTH, RGB, TACTILE
+from dataset_convert.frames import DEPTH, RGB, TACTILE, shape_of
 from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder
+from dataset_convert.poses import pose_features
 from dataset_convert.stats import Stats
 from lerobot_lansar.calvin import ACTION_NAMES, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
 
@@ -29,7 +31,9 @@ _NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
 # ---- cameras and codecs
 
 
-def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) -> tuple[Picture, ...]:
+def pictures_of(
+    images: str, depth: bool, tactile: bool, encoder: RGBEncoder, image_size: int = 0
+) -> tuple[Picture, ...]:
     """All camera features that these options ask for.
 
     Args:
@@ -37,6 +41,7 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
         depth: Both cameras' distances too.
         tactile: The fingertip sensors too. Their depth, fractions of a millimetre, is always stored exactly.
         encoder: Of the colour videos.
+        image_size: Width and height of both cameras' pictures; 0: the cameras' own.
 
     Raises:
         ValueError: LeRobot cannot encode like this here.
@@ -44,15 +49,11 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
     if images == "none":
         return ()
     rgb_codec, depth_codec = (_rgb_codec(encoder), _depth_codec()) if images == "video" else (None, None)
-    found = [
-        Picture(f"observation.images.{array.removeprefix('rgb_')}", array, slice(None), shape, rgb_codec)
-        for array, shape in RGB.items()
-    ]
+    if rgb_codec and image_size % 2 and "444" not in rgb_codec.pix_fmt:
+        raise ValueError(f"--image_size={image_size}: videos as {rgb_codec.pix_fmt} need an even number")
+    found = [_camera_picture(array, image_size, rgb_codec) for array in RGB]
     if depth:
-        found += [
-            Picture(f"observation.images.{array.removeprefix('depth_')}_depth", array, 0, (*shape, 1), depth_codec)
-            for array, shape in DEPTH.items()
-        ]
+        found += [_camera_picture(array, image_size, depth_codec) for array in DEPTH]
     if tactile:
         height, width, _ = TACTILE["rgb_tactile"]
         for finger in range(2):
@@ -61,6 +62,15 @@ def pictures_of(images: str, depth: bool, tactile: bool, encoder: RGBEncoder) ->
             found.append(Picture(key, "rgb_tactile", channels, (height, width, 3), rgb_codec))
             found.append(Picture(f"{key}_depth", "depth_tactile", finger, (height, width, 1)))
     return tuple(found)
+
+
+def _camera_picture(array: str, image_size: int, codec: Codec | None) -> Picture:
+    """The feature that holds one of CALVIN's arrays of a camera's colours or distances."""
+    kind, _, camera = array.partition("_")
+    height, width = shape_of(array, image_size)[:2]
+    if kind == "rgb":
+        return Picture(f"observation.images.{camera}", array, slice(None), (height, width, 3), codec)
+    return Picture(f"observation.images.{camera}_depth", array, 0, (height, width, 1), codec)
 
 
 def _rgb_config(encoder: RGBEncoder) -> RGBEncoderConfig:
@@ -89,7 +99,9 @@ def _depth_codec() -> Codec:
 # ---- the dataset before anything is written
 
 
-def dataset_features(action: str, pictures: tuple[Picture, ...], task_in_state: bool = False) -> dict[str, dict]:
+def dataset_features(
+    action: str, pictures: tuple[Picture, ...], task_in_state: bool = False, camera_poses: bool = False
+) -> dict[str, dict]:
     """LeRobot's description of the dataset's columns.
 
     Args:
@@ -97,6 +109,7 @@ def dataset_features(action: str, pictures: tuple[Picture, ...], task_in_state: 
             `calvin.rel_actions`, names that LeRobot does not take for something a policy should predict.
         pictures: Camera features.
         task_in_state: The scene's state also says which task is commanded.
+        camera_poses: The cameras' poses and intrinsics are observations too.
 
     Returns:
         Feature name to {"dtype", "shape", "names"}, LeRobot's own columns (`index`, ...) included.
@@ -108,6 +121,7 @@ def dataset_features(action: str, pictures: tuple[Picture, ...], task_in_state: 
         "action": _vector(ACTION_NAMES[action]),
         other: _vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
+        **{key: _matrix(numbers) for key, numbers in pose_features(bool(pictures), camera_poses).items()},
     }
     for picture in pictures:
         features[picture.key] = {
@@ -125,12 +139,17 @@ def _vector(names: Iterable[str]) -> dict:
     return {"dtype": "float32", "shape": (len(names),), "names": names}
 
 
-def empty_info(action: str, pictures: tuple[Picture, ...], task_in_state: bool) -> DatasetInfo:
+def _matrix(numbers: int) -> dict:
+    """A square matrix, row by row."""
+    side = math.isqrt(numbers)
+    return _vector(f"row_{row}_column_{column}" for row in range(side) for column in range(side))
+
+
+def empty_info(action: str, pictures: tuple[Picture, ...], task_in_state: bool, camera_poses: bool) -> DatasetInfo:
     """The dataset's description before anything is written."""
     has_videos = any(picture.codec for picture in pictures)
-    return create_empty_dataset_info(
-        CODEBASE_VERSION, CONTROL_HZ, dataset_features(action, pictures, task_in_state), has_videos, "panda"
-    )
+    features = dataset_features(action, pictures, task_in_state, camera_poses)
+    return create_empty_dataset_info(CODEBASE_VERSION, CONTROL_HZ, features, has_videos, "panda")
 
 
 def layout_of(info: DatasetInfo, pictures: tuple[Picture, ...]) -> Layout:

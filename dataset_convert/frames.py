@@ -28,8 +28,6 @@ DEPTH = {f"depth_{camera}": (size, size) for camera, size in CAMERAS.items()}
 TACTILE = {"rgb_tactile": (160, 120, 6), "depth_tactile": (160, 120, 2)}
 """Shapes of the pictures of the two fingertip sensors side by side: uint8 colours, floating-point depth."""
 
-_SHAPES = VECTORS | RGB | DEPTH | TACTILE
-
 _MAX_BYTES = 1 << 20
 """Limit for one array; the largest of a frame takes less than half of it."""
 
@@ -53,9 +51,21 @@ def frame_numbers(folder: Path) -> np.ndarray:
     return np.sort(np.array([number for number in numbers if number.isdecimal()], dtype=np.int64))
 
 
-def read_frame(path: Path, keys: Iterable[str]) -> dict[str, np.ndarray]:
-    """Reads some arrays of a frame file; see `CalvinSplit.read`."""
-    return {key: _checked(array, key, path) for key, array in _load(path, keys).items()}
+def shape_of(array: str, image_size: int = 0) -> tuple[int, ...]:
+    """The shape of one of CALVIN's arrays.
+
+    Args:
+        array: Its name.
+        image_size: Width and height of both cameras' pictures; 0: the cameras' own.
+    """
+    if image_size and array in RGB | DEPTH:
+        return (image_size, image_size, *(RGB | DEPTH)[array][2:])
+    return (VECTORS | RGB | DEPTH | TACTILE)[array]
+
+
+def read_frame(path: Path, keys: Iterable[str], image_size: int = 0) -> dict[str, np.ndarray]:
+    """Reads some arrays of a frame file, whose pictures are of that size; see `CalvinSplit.read`."""
+    return {key: _checked(array, key, path, image_size) for key, array in _load(path, keys).items()}
 
 
 def digest(arrays: dict[str, np.ndarray], so_far: Any = None) -> Any:
@@ -103,8 +113,8 @@ def _read_member(stored: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
         return file.read(member.file_size)
 
 
-def _checked(array: np.ndarray, key: str, path: Path) -> np.ndarray:
-    shape, is_color = _SHAPES[key], key.startswith("rgb_")
+def _checked(array: np.ndarray, key: str, path: Path, image_size: int) -> np.ndarray:
+    shape, is_color = shape_of(key, image_size), key.startswith("rgb_")
     is_right_kind = array.dtype == np.uint8 if is_color else array.dtype.kind == "f"
     if array.shape != shape or not is_right_kind:
         wanted = f"{'uint8' if is_color else 'float'} {shape}"

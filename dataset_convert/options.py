@@ -14,6 +14,7 @@ from dataset_convert.layout import FORMAT, RGBEncoder
 from lerobot_lansar.calvin import CONTROL_MODES
 from lerobot_lansar.jobs.executors import check_executor
 from lerobot_lansar.jobs.work import SlurmConfig
+from lerobot_lansar.pictures import check_size
 
 IMAGES = ("video", "png", "none")
 
@@ -55,6 +56,10 @@ class ConvertConfig:
     task_in_state: bool = False
     # How both cameras are stored: video, png (in the parquet files) or none.
     images: str = "video"
+    # Width and height of both cameras' pictures and depth, as in --env.image_size; 0: 200 and 84, the cameras' own.
+    image_size: int = 0
+    # Store poses and intrinsics of both cameras as observations too, as --env.camera_poses gives them.
+    camera_poses: bool = False
     # Store both cameras' depth (m) too.
     depth: bool = False
     # Store the pictures of the fingertip sensors too.
@@ -96,8 +101,11 @@ class ConvertConfig:
                 raise ValueError(f"--{name}={getattr(self, name)}: expected {' or '.join(choices)}")
         if self.mode == "play" and self.dedup != "none":
             raise ValueError("--dedup needs --mode=windows: in play every frame occurs once")
-        if self.images == "none" and (self.depth or self.tactile):
-            raise ValueError("--images=none excludes --depth and --tactile")
+        if self.images == "none" and (self.depth or self.tactile or self.camera_poses):
+            raise ValueError("--images=none excludes --depth, --tactile and --camera_poses")
+        check_size("--image_size", self.image_size)
+        if self.images == "video" and 0 < self.image_size < 16:
+            raise ValueError(f"--image_size={self.image_size}: videos need 16 pixels or more; --images=png takes any")
         if self.exclude_shared and self.split != "training":
             raise ValueError(f"--exclude_shared needs --split=training, not {self.split}")
         if self.workers < 1:
@@ -132,6 +140,8 @@ class ConvertConfig:
             for name, usual in (
                 ("task_in_state", False),
                 ("scene", ""),
+                ("image_size", 0),
+                ("camera_poses", False),
                 ("lang_folder", LANG_FOLDER),
                 ("lang_embeddings", False),
                 ("block_order", "checked"),

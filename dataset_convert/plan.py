@@ -2,6 +2,7 @@
 
 import sys
 from bisect import bisect_left
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from dataset_convert.episodes import (
 from dataset_convert.frames import RGB, VECTORS
 from dataset_convert.language import read_embeddings
 from dataset_convert.options import ConvertConfig
+from dataset_convert.poses import describe_cameras
 from dataset_convert.shards import Job, cut_into_shards, describe, staging_of
 from dataset_convert.shared import ValidationStates, find_shared
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
@@ -58,8 +60,9 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
 
     from dataset_convert import features  # imports LeRobot, which takes seconds; worker processes import this module
 
-    pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder)
-    info = features.empty_info(config.action, pictures, config.task_in_state)
+    size = _image_size(config, split)
+    pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder, size)
+    info = features.empty_info(config.action, pictures, config.task_in_state, config.camera_poses)
     job = Job(
         split=split,
         folder=staging_of(config.target),
@@ -73,17 +76,36 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
         task_names=[*TASKS, *unknown_tasks],
         scene_names=[*SCENE_NAMES, *sorted(set(scenes) - set(SCENE_NAMES))],
         skip_bad=config.skip_bad,
+        camera_poses=config.camera_poses,
         also_checked=tuple(RGB) if config.embed else (),
         validation=None if config.exclude_shared else validation,
     )
     _check_recorded(job)
     report |= {"license": config.license, "scenes_from": split.scenes_from, "shared_frames": shared}
+    report["look"] = {**asdict(split.look), "image_size": size}
+    report["cameras"] = describe_cameras(job.layout.camera_sizes())
     return job, info, {**report, "left_out": left_out}
 
 
 def warn(text: str) -> None:
     """Prints a line on the standard error stream."""
     print(text, file=sys.stderr)
+
+
+def _image_size(config: ConvertConfig, split: CalvinSplit) -> int:
+    """Width and height of both cameras' pictures in the dataset; 0: the cameras' own.
+
+    Raises:
+        ValueError: They were recorded at another size already; at a second resizing they would no longer be what the
+            environment shows.
+    """
+    recorded = split.look.image_size
+    if config.image_size and recorded not in (0, config.image_size):
+        raise ValueError(
+            f"--image_size={config.image_size}: {split.folder} was recorded with --image_size={recorded}; leave out "
+            "--image_size, or record again without it"
+        )
+    return config.image_size or recorded
 
 
 def _block_orders(

@@ -15,6 +15,7 @@ from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
 from dataset_convert.frames import STATES, VECTORS, digest
 from dataset_convert.layout import Layout
+from dataset_convert.poses import pose_columns
 from dataset_convert.shared import ValidationStates, key_of
 from dataset_convert.writer import FrameBatch, ShardPosition, Written, write_shard
 from lerobot_lansar.calvin import TASKS, continuous_euler
@@ -44,6 +45,7 @@ class Job:
         sentences: The commands; a frame's `task_index` is a place in this list.
         task_names, scene_names: What the numbers in `calvin.task` and `calvin.scene` mean.
         skip_bad: Leave defective episodes out instead of stopping.
+        camera_poses: The cameras' poses and intrinsics are observations too.
         also_checked: CALVIN's picture arrays that must be readable too, although the dataset may not hold them.
         validation: States by which frames that are in validation too are noted; None: they are not looked for.
     """
@@ -60,6 +62,7 @@ class Job:
     task_names: list[str]
     scene_names: list[str]
     skip_bad: bool
+    camera_poses: bool = False
     also_checked: tuple[str, ...] = ()
     validation: ValidationStates | None = None
 
@@ -319,6 +322,7 @@ def to_batch(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: d
         "observation.environment_state": scene,
         "action": absolute if is_absolute else relative,
         "calvin.rel_actions" if is_absolute else "calvin.actions": relative if is_absolute else absolute,
+        **pose_columns(arrays["robot_obs"], job.layout.camera_sizes(), job.camera_poses),
     }
     columns = {
         **{key: vector.astype(np.float32) for key, vector in vectors.items()},

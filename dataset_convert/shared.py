@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.frames import RGB, STATES, frame_file, frame_numbers, read_frame
+from dataset_convert.look import read_look
 from lerobot_lansar.jobs.work import WorkerDied
 
 _CHUNK = 2000
@@ -38,11 +39,13 @@ class ValidationStates:
         folder: The validation split.
         keys: (n,) uint64 hashes of its frames' states, sorted.
         frames: (n,) the frames' numbers.
+        image_size: Width and height of its pictures; 0: the cameras' own.
     """
 
     folder: Path
     keys: np.ndarray
     frames: np.ndarray
+    image_size: int
 
     @classmethod
     def read(cls, folder: Path, workers: int) -> "ValidationStates | None":
@@ -52,7 +55,7 @@ class ValidationStates:
             return None
         keys, readable = _read_keys(folder, frames, workers, "validation's states")
         order = np.argsort(keys[readable], kind="stable")
-        return cls(folder, keys[readable][order], frames[readable][order])
+        return cls(folder, keys[readable][order], frames[readable][order], read_look(folder).image_size)
 
     def among(self, training: Path, frames: np.ndarray, keys: np.ndarray) -> list[int]:
         """Which frames of training are in validation too.
@@ -67,7 +70,7 @@ class ValidationStates:
         for row in np.flatnonzero(end > first):
             mine = frame_file(training, int(frames[row]))
             theirs = (frame_file(self.folder, int(frame)) for frame in self.frames[first[row] : end[row]])
-            if any(_same_pictures(mine, other) for other in theirs):
+            if any(_same_pictures(mine, other, self.image_size) for other in theirs):
                 found.append(int(frames[row]))
         return found
 
@@ -137,13 +140,13 @@ def _keys_of_chunk(folder: Path, frames: np.ndarray) -> list[int | None]:
     return keys
 
 
-def _same_pictures(mine: Path, theirs: Path) -> bool:
-    """Whether two frames have no picture that differs."""
+def _same_pictures(mine: Path, theirs: Path, image_size: int) -> bool:
+    """Whether two frames have no picture that differs; pictures of another size say nothing."""
     for array in RGB:
         try:
-            a, b = (read_frame(path, [array])[array] for path in (mine, theirs))
+            a, b = (read_frame(path, [array], image_size)[array] for path in (mine, theirs))
         except (FileNotFoundError, ValueError):
-            continue  # recorded without this camera
+            continue  # recorded without this camera, or at another size
         if not np.array_equal(a, b):
             return False
     return True

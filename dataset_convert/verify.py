@@ -15,6 +15,8 @@ from tqdm import tqdm
 
 from dataset_convert.episodes import as_ranges
 from dataset_convert.hub import find_dataset
+from dataset_convert.layout import MANIFEST
+from dataset_convert.verify_cameras import check_cameras
 from dataset_convert.verify_claims import Dataset, Mismatch, check_claims
 from dataset_convert.verify_frames import Found, verify_file
 from lerobot_lansar.command import run_command
@@ -50,6 +52,8 @@ def verify(config: VerifyConfig) -> str:
     folder = find_dataset(config.repo_id, config.dataset_dir)
     dataset = Dataset(folder, config.root)
     told = check_claims(dataset)
+    if wrong := check_cameras(dataset):
+        raise Mismatch(f"{folder}/{MANIFEST}: {wrong}")
     found = _verify_frames(dataset, config)
     _check_stats(dataset, found)
     _check_shared(dataset, found)

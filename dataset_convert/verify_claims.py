@@ -13,11 +13,11 @@ from tqdm import tqdm
 from dataset_convert import blocks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, as_ranges, play_spans, window_of_frames, window_spans
-from dataset_convert.frames import DEPTH, RGB, TACTILE
+from dataset_convert.frames import DEPTH, RGB, TACTILE, shape_of
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name, read_embeddings
 from dataset_convert.layout import FORMAT, MANIFEST
 from dataset_convert.verify_shared import ValidationFrames
-from lerobot_lansar.calvin import CONTROL_HZ, SCENE_NAMES, TASKS
+from lerobot_lansar.calvin import CAMERAS, CONTROL_HZ, SCENE_NAMES, TASKS
 from lerobot_lansar.clip.store import dataset_fingerprint, sha256
 
 
@@ -87,6 +87,11 @@ class Dataset:
         """The command of a window, -1 for none."""
         return self.split.windows[window].sentence if window >= 0 else NO_COMMAND
 
+    def camera_sizes(self) -> dict[str, int]:
+        """Camera to the width and height of its pictures."""
+        keys = {camera: f"observation.images.{camera}" for camera in CAMERAS}
+        return {camera: self.features[key]["shape"][0] for camera, key in keys.items() if key in self.features}
+
     def source_of(self, feature: str) -> tuple[str, Any]:
         """CALVIN's array that a camera feature shows, and the part of its last axis."""
         name = feature.removeprefix("observation.images.")
@@ -139,11 +144,19 @@ def _check_manifest(dataset: Dataset) -> None:
         ("task_names", manifest["task_names"][: len(TASKS)], list(TASKS)),
         ("scene_names", manifest["scene_names"][: len(SCENE_NAMES)], list(SCENE_NAMES)),
         ("scenes", manifest["scenes"], scenes),
+        ("look", manifest["look"], _look(dataset)),
         ("contradictions", manifest["contradictions"], dataset.contradictions),
     ):
         if told != found:
             what = "something else" if "_names" in name or name == "windows" else f"{told}, {found}"
             raise Mismatch(f"{dataset.folder}/{MANIFEST}: {name} are not what {split.folder} says: {what}")
+
+
+def _look(dataset: Dataset) -> dict[str, Any]:
+    """What drew the source's pictures, and the size that the dataset must have them in."""
+    look = dataset.split.look
+    size = dataset.manifest["request"].get("image_size", 0) or look.image_size
+    return {"renderer": look.renderer, "assets": look.assets, "image_size": size}
 
 
 def _check_shared(dataset: Dataset) -> None:
@@ -240,7 +253,8 @@ def _check_pictures(dataset: Dataset) -> None:
     for key, feature in dataset.features.items():
         if feature["dtype"] not in ("video", "image"):
             continue
-        height, width = (RGB | DEPTH | TACTILE)[dataset.source_of(key)[0]][:2]
+        size = dataset.manifest["request"].get("image_size", 0) or dataset.split.look.image_size
+        height, width = shape_of(dataset.source_of(key)[0], size)[:2]
         wanted = [height, width, 1 if key.endswith("_depth") else 3], ["height", "width", "channels"]
         if (feature["shape"], feature["names"]) != wanted:
             told = f"{feature['shape']} {feature['names']}"

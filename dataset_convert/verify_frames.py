@@ -17,8 +17,10 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from dataset_convert.frames import STATES, VECTORS, digest
+from dataset_convert.verify_cameras import camera_matrices
 from dataset_convert.verify_claims import Dataset, Mismatch, chunk_and_file
 from lerobot_lansar.calvin import COLORS, CONTROL_HZ, TASKS
+from lerobot_lansar.pictures import resize
 
 _BETTER = 0.9
 """Wrong pictures fit better than the right ones if their squared error is less than this share of it. A video of the
@@ -145,8 +147,14 @@ def _in_validation(dataset: Dataset, group: _RowGroup) -> set[int]:
 
 def _compare_columns(dataset: Dataset, group: _RowGroup, found: Found) -> None:
     """Compares all columns but the pictures, which must be equal, and takes them into `found`."""
-    for name, wanted in _wanted(dataset, group).items():
-        if not np.array_equal(_numbers(group.rows[name]), wanted):
+    wanted_poses = {
+        key: matrices.reshape(len(group.rows), -1).astype(np.float32)
+        for key, matrices in camera_matrices(dataset, group.source["robot_obs"]).items()
+    }
+    for name, wanted in (_wanted(dataset, group) | wanted_poses).items():
+        stored = _numbers(group.rows[name])
+        # Poses are computed here in another way than by the converter, so their last digits may differ.
+        if not (np.allclose(stored, wanted, atol=2e-6) if name in wanted_poses else np.array_equal(stored, wanted)):
             raise Mismatch(f"{group.place}: column {name} is not what the source says")
         if name in dataset.features and wanted.dtype == np.float32:
             found.add_values(name, wanted)
@@ -232,6 +240,9 @@ def _pictures(dataset: Dataset, group: _RowGroup, key: str) -> np.ndarray:
     """The source's pictures that a camera feature shows."""
     array, part = dataset.source_of(key)
     pictures = group.source[array]
+    size = dataset.manifest["request"].get("image_size", 0)
+    if size and not array.endswith("_tactile"):
+        pictures = np.stack([resize(picture, size) for picture in pictures])
     return pictures if pictures.ndim == 3 else pictures[..., part]
 
 

@@ -242,7 +242,6 @@ def test_diffusion_trains_on_one_camera_of_the_dataset_and_runs_on_the_desk(run,
     assert len(successes(work, "eval_diffusion")[0]) == 1
 
 
-@pytest.mark.xfail(strict=True, reason="lansar-convert has no --image_size yet")
 def test_depth_and_cameras_of_one_size_from_the_recording_to_the_evaluation(run, work):
     one_task = ["--tasks=[turn_on_led]", "--episodes=2", "--validation_episodes=1"]
     run("lansar-record", "--output_dir=deep", *one_task, "--depth=true")

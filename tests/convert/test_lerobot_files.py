@@ -15,6 +15,7 @@ from dataset_convert.layout import RGBEncoder
 from dataset_convert.options import ConvertConfig
 from dataset_convert.stats import EpisodeStats
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
+from lerobot_lansar.cameras import gripper_camera_pose
 
 CAMERA_OF = {"observation.images.static": "rgb_static", "observation.images.gripper": "rgb_gripper"}
 
@@ -72,6 +73,8 @@ def both(request, tmp_path_factory):
             item |= {f"calvin.{name}": np.array([value]) for name, value in numbers.items()}
             if images != "none":
                 item |= {key: content[camera] for key, camera in CAMERA_OF.items()}
+                pose = gripper_camera_pose(content["robot_obs"])
+                item["calvin.gripper_camera_pose"] = pose.reshape(16).astype(np.float32)
             theirs.add_frame({**item, "task": sentence})
         theirs.save_episode(parallel_encoding=False)
     theirs.finalize()
