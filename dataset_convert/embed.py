@@ -18,7 +18,7 @@ from tqdm import tqdm
 from dataset_convert import card
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.hub import find_dataset
-from dataset_convert.layout import MANIFEST
+from dataset_convert.layout import MANIFEST, check_format
 from lerobot_lansar.clip.store import IMAGE_FEATURES, EmbeddingWriter, clip_dir, dataset_fingerprint
 from lerobot_lansar.command import run_command
 from lerobot_lansar.pictures import resize
@@ -221,10 +221,13 @@ def run(config: EmbedConfig) -> None:
     root = find_dataset(config.repo_id, config.dataset_dir)
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root} holds no LeRobotDataset: give its folder as --dataset_dir")
+    has_card = (root / MANIFEST).exists()
+    if has_card:
+        check_format(root, json.loads((root / MANIFEST).read_text()))
     clip = load_clip(config.clip.model, config.clip.pretrained)
     pictures = DatasetPictures(config.repo_id, root)
     embed(root, pictures, clip, config.clip, batch_size=config.batch_size, num_workers=config.num_workers)
-    if (root / MANIFEST).exists():
+    if has_card:
         card.write(root, config.repo_id)
     print(f"embeddings are in {clip_dir(root)}")
 

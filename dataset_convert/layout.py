@@ -1,6 +1,7 @@
 """How a converted dataset lies on disk: its frame tables, camera features, videos and manifest."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,16 @@ MANIFEST = "meta/calvin_source.json"
 
 FORMAT = 2
 """Of what is written, in the manifest. 1 had CALVIN's own angles in states, which jump."""
+
+
+def check_format(folder: Path, manifest: dict[str, Any]) -> None:
+    """Raises ValueError if a dataset was made by a version of the converter that wrote another format."""
+    found = manifest["request"].get("format", 1)
+    if found != FORMAT:
+        raise ValueError(
+            f"{folder} was made by another version of lansar-convert (format {found}, here {FORMAT}; format 1 has "
+            "CALVIN's own angles, which jump): convert again"
+        )
 
 
 # H.264 at these settings keeps pictures as well as LeRobot's default (libsvtav1, crf 30) in a tenth of the time, takes

@@ -89,8 +89,20 @@ def _each(work: Callable[[Path], Found], files: list[Path], workers: int) -> Ite
     if workers == 1:
         yield from map(work, files)
         return
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap_unordered(work, files)
+    with multiprocessing.get_context("spawn").Pool(workers, _keep, (work,)) as pool:
+        yield from pool.imap_unordered(_call, files)
+
+
+_kept: list[Callable[[Path], Found]] = []
+
+
+def _keep(work: Callable[[Path], Found]) -> None:
+    """Gives a process its work once: what it knows of the dataset is megabytes, too much to send with every file."""
+    _kept.append(work)
+
+
+def _call(file: Path) -> Found:
+    return _kept[0](file)
 
 
 def _check_stats(dataset: Dataset, found: Found) -> None:

@@ -15,7 +15,7 @@ from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, as_ranges, play_spans, window_of_frames, window_spans
 from dataset_convert.frames import DEPTH, RGB, TACTILE, shape_of
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name, read_embeddings
-from dataset_convert.layout import FORMAT, MANIFEST
+from dataset_convert.layout import MANIFEST, check_format
 from dataset_convert.verify_shared import ValidationFrames
 from lerobot_lansar.calvin import CAMERAS, CONTROL_HZ, SCENE_NAMES, TASKS
 from lerobot_lansar.clip.store import dataset_fingerprint, sha256
@@ -53,11 +53,7 @@ class Dataset:
         self.folder = folder
         self.manifest = json.loads((folder / MANIFEST).read_text())
         request = self.manifest["request"]
-        if request.get("format", 1) != FORMAT:
-            raise ValueError(
-                f"{folder} was made by another version of lansar-convert (format {request.get('format', 1)}, here "
-                f"{FORMAT}; its angles are CALVIN's own, which jump, if it is 1): convert again"
-            )
+        check_format(folder, self.manifest)
         options = {name: request[name] for name in ("lang_folder", "scene", "skip_bad") if name in request}
         self.split = CalvinSplit(root, request["split"], **options)
         if self.split.source_sha256 != request["source_sha256"]:

@@ -224,6 +224,16 @@ def test_a_download_from_the_hub_is_embedded_without_touching_the_cache(made, ru
     assert "clip: as lansar-tiny" in verify(VerifyConfig("me/desk", made / "calvin"))
 
 
+def test_a_dataset_of_an_earlier_version_is_refused(made, run, tmp_path):
+    dataset = without_clip(made, "png", tmp_path)
+    manifest = json.loads((dataset / "meta/calvin_source.json").read_text())
+    del manifest["request"]["format"]
+    (dataset / "meta/calvin_source.json").write_text(json.dumps(manifest))
+    code, printed = run(dataset)
+    assert code == 2
+    assert "convert again" in printed.err
+
+
 def test_bad_input_is_one_clear_message(made, run, tmp_path):
     for arguments, message in (
         ((made / "none",), "has no observation.images.gripper, observation.images.static: convert it with"),
