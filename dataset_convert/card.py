@@ -200,6 +200,8 @@ def _colors(manifest: dict[str, Any]) -> str:
             f"**Colours or scenes are wrong:** {what}. Converted all the same, with `{option}`: do not trust the "
             "colours of blocks, in commands or in `observation.environment_state`."
         )
+    if not total:
+        return "**Wrong colours:** unknown: no annotated window lifts a block, which is what would show them."
     return (
         f"**Wrong colours:** {total} annotated windows of the split lift a block, by `scene_obs`. It is the one that "
         f"the task names {found}. Other tasks than `lift_…` were not examined."

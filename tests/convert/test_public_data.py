@@ -152,6 +152,13 @@ def test_wrong_colors_are_an_error_that_names_both_corrections_unless_the_user_i
         assert "4 episodes" in verify(VerifyConfig("me/desk", calvin.root, out))
 
 
+def test_colors_that_nothing_confirms_are_called_unknown(tmp_path):
+    calvin = write_calvin(tmp_path / "calvin", tasks=("open_drawer",))
+    card = (convert(options(calvin, tmp_path / "out")) / "README.md").read_text()
+    assert "**Wrong colours:** unknown" in card
+    assert "It is the one that" not in card
+
+
 @pytest.mark.parametrize(
     ("scene", "slides", "against"),
     [
