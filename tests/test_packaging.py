@@ -130,3 +130,9 @@ def test_every_file_that_the_documentation_names_exists():
     }
     assert len(named) > 10
     assert [entry for entry in sorted(named) if not (ROOT / entry[1]).exists()] == []
+
+
+def test_no_two_test_files_share_a_name():
+    # pytest imports files of folders that are no packages by their names alone.
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
