@@ -19,6 +19,7 @@ from dataset_convert import card
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.hub import find_dataset
 from dataset_convert.layout import MANIFEST, check_format
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.store import IMAGE_FEATURES, EmbeddingWriter, clip_dir, dataset_fingerprint
 from lerobot_lansar.command import run_command
 from lerobot_lansar.pictures import resize
@@ -33,16 +34,6 @@ _SAVE_EVERY = 20  # batches
 
 
 @dataclass
-class ClipOptions:
-    """Which CLIP embeds the pictures."""
-
-    # Name of the model in open_clip.
-    model: str = "ViT-B-32"
-    # open_clip's tag of the weights, or a file of weights; empty: untrained.
-    pretrained: str = "openai"
-
-
-@dataclass
 class EmbedConfig:
     """Stores CLIP embeddings of a LeRobotDataset's pictures in its folder `clip`."""
 
@@ -51,7 +42,7 @@ class EmbedConfig:
     # Its folder; by default where LeRobot looks for a dataset of that name, or LeRobot's download from the hub.
     dataset_dir: Path | None = None
     # Which CLIP embeds the pictures.
-    clip: ClipOptions = field(default_factory=ClipOptions)
+    clip: ClipConfig = field(default_factory=ClipConfig)
     # Pictures of each camera at a time.
     batch_size: int = 128
     # Processes that decode pictures, beside the one that embeds them.
@@ -148,7 +139,7 @@ def load_clip(model: str, pretrained: str) -> "Clip":
     # Take seconds, and lansar-convert's worker processes import this module.
     import torch
 
-    from lerobot_lansar.clip.model import Clip, ClipConfig
+    from lerobot_lansar.clip.model import Clip
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -161,7 +152,7 @@ def embed(
     root: Path,
     pictures: Pictures,
     clip: "Clip",
-    options: ClipOptions,
+    options: ClipConfig,
     *,
     batch_size: int = 128,
     num_workers: int = 0,

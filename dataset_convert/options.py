@@ -6,12 +6,12 @@ from typing import Any
 
 from dataset_convert.blocks import BLOCK_ORDERS
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.embed import ClipOptions
 from dataset_convert.episodes import DEDUP, MODES
 from dataset_convert.hub import folder_of
 from dataset_convert.language import LANG_FOLDER
 from dataset_convert.layout import FORMAT, RGBEncoder
 from lerobot_lansar.calvin import CONTROL_MODES
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.jobs.executors import check_executor
 from lerobot_lansar.jobs.work import SlurmConfig
 from lerobot_lansar.pictures import check_size
@@ -69,7 +69,7 @@ class ConvertConfig:
     # Compute CLIP embeddings of the pictures and store them beside the data.
     embed: bool = False
     # Which CLIP computes the embeddings.
-    clip: ClipOptions = field(default_factory=ClipOptions)
+    clip: ClipConfig = field(default_factory=ClipConfig)
     # Processes that convert in parallel.
     workers: int = 1
     # Where they run: local, slurm or ray.

@@ -18,9 +18,9 @@ from fake_calvin import COMMANDS, without_jumps, write_calvin
 
 from dataset_convert import convert
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.embed import ClipOptions
 from dataset_convert.options import ConvertConfig
 from lerobot_lansar.calvin import COLORS, TASKS, relative_action
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.jobs import staging
 
 
@@ -399,7 +399,7 @@ def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_p
     import torch
 
     calvin = write_calvin(tmp_path / "calvin", rgb=True, overlap=3, length=5)
-    clip_options = ClipOptions(model="lansar-tiny", pretrained="")
+    clip_options = ClipConfig(model="lansar-tiny", pretrained="")
     out = convert.convert(options(calvin, tmp_path / "out", embed=True, clip=clip_options))
     clip = clip_module.Clip(clip_module.ClipConfig(model="lansar-tiny", pretrained=""))
     frames = [frame for start, end, *_ in calvin.windows for frame in range(start, end)]

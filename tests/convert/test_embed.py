@@ -12,15 +12,15 @@ from huggingface_hub.utils import DEFAULT_IGNORE_PATTERNS, filter_repo_objects
 
 from dataset_convert import embed
 from dataset_convert.convert import convert
-from dataset_convert.embed import ClipOptions
 from dataset_convert.options import ConvertConfig
 from dataset_convert.verify import Mismatch, VerifyConfig, verify
 from lerobot_lansar.clip import store
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.store import sha256
 
 clip_module = pytest.importorskip("lerobot_lansar.clip.model")
 
-TINY = ClipOptions(model="lansar-tiny", pretrained="")
+TINY = ClipConfig(model="lansar-tiny", pretrained="")
 ARGUMENTS = ["--repo_id=me/desk", "--clip.model=lansar-tiny", "--clip.pretrained="]
 FILES = [f"clip/observation.images.{camera}.npy" for camera in ("static", "gripper")]
 

@@ -14,9 +14,9 @@ from fake_calvin import write_calvin
 from hub_server import TOKEN, Hub
 
 from dataset_convert import convert
-from dataset_convert.embed import ClipOptions
 from dataset_convert.hub import find_dataset
 from dataset_convert.options import ConvertConfig
+from lerobot_lansar.clip.config import ClipConfig
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -95,7 +95,7 @@ def run(launch):
 @pytest.mark.timeout(1800)  # eight commands, each of which imports LeRobot
 def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
     calvin = write_calvin(tmp_path / "calvin", rgb=True, length=11)  # no two files are equal
-    clip = ClipOptions(model="lansar-tiny", pretrained="")
+    clip = ClipConfig(model="lansar-tiny", pretrained="")
     out = convert.convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", embed=True, clip=clip))
     arguments = [
         "lansar-convert",

@@ -114,9 +114,9 @@ def test_embeddings_are_those_of_pictures_of_the_datasets_size(painted, tmp_path
     clip_module = pytest.importorskip("lerobot_lansar.clip.model")
     import torch
 
-    from dataset_convert.embed import ClipOptions
+    from lerobot_lansar.clip.config import ClipConfig
 
-    asked = {"embed": True, "clip": ClipOptions("lansar-tiny", ""), "image_size": 32}
+    asked = {"embed": True, "clip": ClipConfig("lansar-tiny", ""), "image_size": 32}
     out = convert(options(painted, tmp_path / "out", **asked))
     clip = clip_module.Clip(clip_module.ClipConfig("lansar-tiny", ""))
     seen = torch.from_numpy(resize(painted.frames[101]["rgb_static"], 32))[None]

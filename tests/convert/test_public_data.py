@@ -277,11 +277,11 @@ def test_recordings_outside_all_scenes_can_be_left_out_of_play(calvin, tmp_path)
 
 def test_pictures_are_checked_where_only_embeddings_need_them(tmp_path):
     pytest.importorskip("lerobot_lansar.clip.model")
-    from dataset_convert.embed import ClipOptions
+    from lerobot_lansar.clip.config import ClipConfig
 
     calvin = write_calvin(tmp_path / "calvin", rgb=True, tasks=("open_drawer",) * 2, length=4)
     calvin.rewrite(102, rgb_static=np.zeros((200, 199, 3), np.uint8))
-    asked = {"embed": True, "clip": ClipOptions("lansar-tiny", "")}
+    asked = {"embed": True, "clip": ClipConfig("lansar-tiny", "")}
     with pytest.raises(ValueError, match=r"episode_0000102\.npz: array 'rgb_static' is uint8"):
         convert(options(calvin, tmp_path / "out", **asked))
     out = convert(options(calvin, tmp_path / "out", skip_bad=True, **asked))
