@@ -38,6 +38,8 @@ class KeyValueCache:
     def add(self, environments: list[int], steps: int) -> "CacheView":
         """Makes room for the next `steps` steps of each of `environments`, which are then decoded at once.
 
+        An environment may be named several times; it is then decoded as often, with the same result.
+
         Raises:
             ValueError: The window is full; or, with `prepended`, some of `environments` are empty and others are not.
         """
@@ -48,7 +50,7 @@ class KeyValueCache:
             raise ValueError("environments at their first step have one token more than the others")
         first = [token_count(n, self.prepended) for n in held]
         count = token_count(held[0] + steps, self.prepended) - first[0]
-        for environment in environments:
+        for environment in set(environments):
             self.steps[environment] += steps
         return CacheView(self.entries, environments, first, count)
 
@@ -64,21 +66,21 @@ class CacheView:
 
     Attributes:
         positions: (B, t) position in the window of each new token.
-        mask: (B, 1, t, s) bool, True where a new token may attend to one of the first s tokens.
+        mask: (B, 1, t, s) bool, True where a new token may attend to one of the window's s tokens.
     """
 
     def __init__(self, entries: Tensor, environments: list[int], first: list[int], count: int) -> None:
-        self._entries, self._end = entries, max(first) + count
+        self._entries = entries
         device = entries.device
         self._environments = torch.tensor(environments, device=device)
         neighbours = slice(environments[0], environments[0] + len(environments))
         in_line = environments == list(range(neighbours.start, neighbours.stop))
         self._selection = neighbours if in_line else self._environments  # a slice copies nothing
         self.positions = torch.tensor(first, device=device)[:, None] + torch.arange(count, device=device)
-        self.mask = (torch.arange(self._end, device=device) <= self.positions[..., None])[:, None]
+        self.mask = (torch.arange(entries.shape[-2], device=device) <= self.positions[..., None])[:, None]
 
     def update(self, slot: tuple[int, int], keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Stores the new tokens' keys and values, (B, heads, t, head_size), and returns those of all tokens so far.
+        """Stores the new tokens' keys and values, (B, heads, t, head_size), and returns those of the whole window.
 
         Args:
             slot: Number of the decoder layer; 0 for its self-attention, 1 for its cross-attention.
@@ -90,4 +92,4 @@ class CacheView:
         stored = self._entries[slot]
         for buffer, new in zip(stored, (keys, values), strict=True):
             buffer[self._environments[:, None], :, self.positions] = new.transpose(1, 2)
-        return stored[0, self._selection, :, : self._end], stored[1, self._selection, :, : self._end]
+        return stored[0, self._selection], stored[1, self._selection]

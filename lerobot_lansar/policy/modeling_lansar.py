@@ -1,12 +1,15 @@
 """LanSAR for LeRobot: the loss in training; at inference one action per step, with a history per environment."""
 
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from huggingface_hub import ModelCard
+from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -15,6 +18,7 @@ from torch import Tensor
 from ..calvin import ANGLE_UNIT, CONTROL_MODES, GRIPPER_ACTION, POSITION_UNIT, TCP_POSE
 from .card import card_text
 from .configuration_lansar import LanSARConfig
+from .losses import Losses
 from .network import LanSARNetwork
 from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, VALID_STEPS
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
@@ -39,6 +43,9 @@ class History:
     contexts: Tensor
     states: Tensor
 
+
+SMALLEST_GROUP = 4
+"""Environments that are decoded together at least: for fewer rows, matrix products round in another order."""
 
 TRAINED_OPTIONS = (
     "hidden",
@@ -86,6 +93,7 @@ class LanSARPolicy(PreTrainedPolicy):
     ) -> None:
         super().__init__(config)
         config.validate_features()
+        self._losses: Losses | None = None  # in training only
         self.scaler = Scaler(config.orientation, config.egocentric_blocks)
         self.network = LanSARNetwork(config.network)
         if dataset_meta is not None:
@@ -98,6 +106,9 @@ class LanSARPolicy(PreTrainedPolicy):
                 torch.tensor(windows.targets[windows.has_target, :6]),
             )
             set_current(windows)
+            self._losses = Losses()
+            if parser.parse_arg("resume") == "true":
+                self._losses.load(Path(str(config.pretrained_path)))
         self.reset()
 
     def _check_pretrained(self) -> None:
@@ -128,6 +139,12 @@ class LanSARPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Clears all histories; LeRobot calls this before each batch of episodes."""
         self._histories: list[History] = []
+
+    def reset_environments(self, environments: Iterable[int]) -> None:
+        """Clears the histories of some environments of the batch; `lansar-eval` calls this where a command begins."""
+        for i in environments:
+            if i < len(self._histories):
+                self._clear(i, "")
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Loss of a batch of windows (Eq 4.3-4.6).
@@ -164,8 +181,10 @@ class LanSARPolicy(PreTrainedPolicy):
         if contrast is not None:
             terms["contrastive_loss"] = contrast
             loss = loss + self.config.contrastive_weight * contrast
-        values = torch.stack(list(terms.values())).tolist()  # LeRobot logs plain numbers only; one wait for the GPU
-        return loss, dict(zip(terms, values, strict=True))
+        values = torch.stack([loss.mean(), *terms.values()]).tolist()  # LeRobot logs plain numbers; one wait for the GPU
+        if self._losses is not None:
+            self._losses.add(values[0], self.training)
+        return loss, dict(zip(terms, values[1:], strict=True))
 
     def _loss_terms(self, batch: dict[str, Any]) -> tuple[dict[str, Tensor], Tensor | None]:
         """Every term's value at each valid step, (N,) float32; the batch's contrastive loss, if it is used."""
@@ -243,8 +262,11 @@ class LanSARPolicy(PreTrainedPolicy):
             self._cache = self.network.new_cache(len(commands))
         for i, (history, command) in enumerate(zip(self._histories, commands, strict=True)):
             if history.command != command or history.steps >= self.config.history_clear_steps:
-                self._histories[i] = self._empty_history(command)
-                self._cache.steps[i] = 0
+                self._clear(i, command)
+
+    def _clear(self, i: int, command: str) -> None:
+        self._histories[i] = self._empty_history(command)
+        self._cache.steps[i] = 0
 
     def _empty_history(self, command: str) -> History:
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
@@ -287,12 +309,18 @@ class LanSARPolicy(PreTrainedPolicy):
             history.states = torch.cat([history.states, states[i : i + 1]])
 
     def _decode_newest(self, commands: tuple[Tensor, Tensor]) -> Tensor:
-        """The decoder's output at each environment's newest step, (B, h); steps in the cache are not decoded again."""
+        """The decoder's output at each environment's newest step, (B, h); steps in the cache are not decoded again.
+
+        An environment's output does not depend on the others, not even in rounding: smaller groups are filled up with
+        copies, and all keys of the cache always take part. (Measured on a CPU with `hidden` 96 and 512, in batches of
+        at least `SMALLEST_GROUP`. With layers of odd widths, such as `hidden` 32 has, it does.)
+        """
         newest = torch.empty_like(commands[0])
         groups: dict[tuple[int, bool], list[int]] = {}  # environments with the same number of new steps
         for i, (history, held) in enumerate(zip(self._histories, self._cache.steps, strict=True)):
             groups.setdefault((len(history.contexts) - held, held == 0), []).append(i)
         for (new, _), members in groups.items():
+            members = members + members[:1] * (min(SMALLEST_GROUP, len(self._histories)) - len(members))
             cache = self._cache.add(members, new)
             histories = [self._histories[i] for i in members]
             contexts = torch.stack([history.contexts[-new:] for history in histories])
@@ -323,6 +351,11 @@ class LanSARPolicy(PreTrainedPolicy):
             mode = torch.full_like(gripper, CONTROL_MODES.index(config.control_mode))
         is_absolute = mode == CONTROL_MODES.index("abs")
         return torch.cat([torch.where(is_absolute, absolute, relative), gripper], dim=1)
+
+    def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
+        super()._save_pretrained(save_directory, **kwargs)
+        if self._losses is not None:
+            self._losses.save(save_directory)
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
         """The card of an uploaded policy: LeRobot's data for the hub's search, our text."""

@@ -422,12 +422,15 @@ class LanSARNetwork(nn.Module):
 
 
 def attention_weights(q: Tensor, k: Tensor, mask: Tensor | None, causal: bool) -> Tensor:
-    """The weights that scaled_dot_product_attention uses but does not return (Eq 2.4): (B, heads, t, s)."""
+    """The weights that scaled_dot_product_attention uses but does not return (Eq 2.4): (B, heads, t, s).
+
+    With a mask, s ends with the last token that anything attends to.
+    """
     scores = q @ k.transpose(-2, -1) / q.shape[-1] ** 0.5
     if causal:
         mask = torch.ones(scores.shape[-2:], dtype=torch.bool, device=q.device).tril()
     if mask is not None:
-        scores = scores.masked_fill(~mask, -torch.inf)
+        scores = scores.masked_fill(~mask, -torch.inf)[..., : int(mask.sum(dim=-1).max())]
     return scores.softmax(dim=-1)
 
 

@@ -39,6 +39,13 @@ def step(policy, rng, tasks, **extra):
     return batch, policy.select_action(batch)
 
 
+def act_once(policy, seen, commands):
+    """The actions of a policy without pictures on an observation; every command has an embedding of its own."""
+    size = embedding_size(policy.config.clip.model)
+    embeddings = [torch.randn(size, generator=torch.Generator().manual_seed(sum(map(ord, c)))) for c in commands]
+    return policy.select_action({**seen, "observation.clip.command": torch.stack(embeddings), "task": commands})
+
+
 def sampled_frames(*index):
     """What LeRobot's data loader gives the preprocessor: single frames, whose contents go unread."""
     frames = {"index": torch.tensor(index), "task": list(COMMANDS[: len(index)])}
@@ -479,3 +486,39 @@ def test_options_of_training_change_training_only(tmp_path):
     torch.testing.assert_close(policy.forward(batch, reduction="none")[0].mean(), loss)
     weights = {"contrastive_loss": 0.5}
     assert sum(weights.get(k, 1) * v for k, v in parts.items()) == pytest.approx(loss.item(), rel=1e-5)
+
+
+def test_an_environments_actions_do_not_depend_on_the_others_of_its_batch():
+    """Not even in rounding: an evaluation gives the same results in any number of workers and after an interruption."""
+    policy = make_policy(use_images=False, hidden=96, feedforward=384)
+    rows, steps = 9, 30
+    rng = np.random.default_rng(0)
+    seen = [observation(rng, rows) for _ in range(steps)]
+
+    def act(chosen, lengths):
+        """Actions of some environments, (steps, rows, 7); the command of each changes after so many steps."""
+        policy.reset()
+        taken = []
+        for t, everything in enumerate(seen):
+            batch = {key: value[list(chosen)] for key, value in everything.items()}
+            taken.append(act_once(policy, batch, [str(t // lengths[row]) for row in chosen]))
+        return torch.stack(taken)
+
+    lengths = rng.integers(3, 12, rows)
+    together = act(range(rows), lengths)
+    others = lengths + 2
+    others[[1, 6]] = lengths[[1, 6]]
+    assert torch.equal(act([8, 6, 0, 1, 3], others)[:, [1, 3]], together[:, [6, 1]])
+    np.testing.assert_allclose(act([6], lengths)[:, 0], together[:, 6], atol=1e-5)  # alone, rounding differs
+
+
+def test_single_environments_of_a_batch_can_be_reset():
+    policy = make_policy(use_images=False)
+    rng = np.random.default_rng(0)
+    first, second = observation(rng, 4), observation(rng, 4)
+    fresh = act_once(policy, second, ["go"] * 4)
+    policy.reset()
+    act_once(policy, first, ["go"] * 4)
+    policy.reset_environments([2])
+    mixed = act_once(policy, second, ["go"] * 4)
+    assert [torch.equal(mixed[i], fresh[i]) for i in range(4)] == [False, False, True, False]

@@ -95,6 +95,16 @@ def test_lerobot_train_trains_resumes_fine_tunes_and_measures_a_held_out_loss(tm
     steps = [s["registry_name"] for s in json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]]
     assert {"rename_observations_processor", "device_processor", "normalizer_processor"} < set(steps)
     assert str(tmp_path) not in (checkpoint / "policy_preprocessor.json").read_text()
+    # each checkpoint holds its run's losses: those of a resumed run go on, those of a fine-tuned one begin anew
+    printed = [float(loss) for loss in re.findall(r" loss:([\d.]+)", result.stderr)]
+    held_out = [float(loss) for loss in re.findall(r"eval_loss=([\d.]+)", result.stderr)]
+    expected = [(2, "training", sum(printed[:2]) / 2), (2, "held_out", held_out[0])]
+    expected += [(4, "training", sum(printed[2:4]) / 2), (4, "held_out", held_out[1])]
+    for folder, entries in ((checkpoint, expected), (tuned, [(1, "training", printed[4])])):
+        losses = json.loads((folder / "losses.json").read_text())
+        assert [(entry["update"], *(set(entry) - {"update"})) for entry in losses] == [e[:2] for e in entries]
+        for entry, (_, kind, value) in zip(losses, entries, strict=True):
+            assert entry[kind] == pytest.approx(value, abs=6e-4)  # as exact as LeRobot prints it
 
 
 @pytest.mark.parametrize(
