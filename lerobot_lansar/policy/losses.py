@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 LOSSES_FILE = "losses.json"
-"""File in a checkpoint's `pretrained_model`: a list of {"update": int, "training": float} and {…, "held_out": float}."""
+"""In a checkpoint's `pretrained_model`: a list of {"update": int, "training": float} and {…, "held_out": float}."""
 
 EVERY = 20
 """Updates whose training losses are averaged to one entry."""

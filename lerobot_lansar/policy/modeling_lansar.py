@@ -181,7 +181,7 @@ class LanSARPolicy(PreTrainedPolicy):
         if contrast is not None:
             terms["contrastive_loss"] = contrast
             loss = loss + self.config.contrastive_weight * contrast
-        values = torch.stack([loss.mean(), *terms.values()]).tolist()  # LeRobot logs plain numbers; one wait for the GPU
+        values = torch.stack([loss.mean(), *terms.values()]).tolist()  # plain numbers for LeRobot; one wait for a GPU
         if self._losses is not None:
             self._losses.add(values[0], self.training)
         return loss, dict(zip(terms, values[1:], strict=True))
