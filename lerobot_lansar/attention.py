@@ -22,8 +22,7 @@ import numpy as np
 import torch
 from lerobot.configs import parser
 from lerobot.configs.eval import EvalPipelineConfig
-from lerobot.envs.factory import make_env, make_env_pre_post_processors
-from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.envs.factory import make_env
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.io_utils import write_video
@@ -33,6 +32,7 @@ from matplotlib.figure import Figure  # not pyplot: a bare figure is drawn by Ag
 from matplotlib.image import AxesImage
 
 from .command import run_command
+from .evaluation.loading import load_policy
 from .policy.modeling_lansar import LanSARPolicy
 from .policy.network import recorded_attention
 
@@ -175,20 +175,15 @@ def observe(config: AttentionConfig) -> Attention:
     set_seed(config.seed)
     envs = make_env(config.env, n_envs=1)
     env = next(iter(next(iter(envs.values())).values()))
-    policy = make_policy(config.policy, env_cfg=config.env).eval()
+    assert config.policy is not None
+    policy, processors = load_policy(config.policy, config.env)
     assert isinstance(policy, LanSARPolicy)
-    overrides = {"device_processor": {"device": str(policy.config.device)}}
-    processors = make_pre_post_processors(
-        config.policy, pretrained_path=str(config.policy.pretrained_path), preprocessor_overrides=overrides
-    )
-    env_processors = make_env_pre_post_processors(config.env, config.policy)
     recorder = Recorder(policy, env)
     try:
         with torch.no_grad(), recorder.recording():
             rollout(
                 env,
                 policy,
-                *env_processors,
                 *processors,
                 seeds=None if config.seed is None else [config.seed],
                 render_callback=recorder.add_frame,

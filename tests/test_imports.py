@@ -30,6 +30,7 @@ FLOORS = [
     ("lerobot_lansar.demos", "lerobot_lansar.envs"),
     (
         "lerobot_lansar.attention",
+        "lerobot_lansar.evaluation",
         "lerobot_lansar.replay",
         "lerobot_lansar.cli",
         "lerobot_policy_lansar",

@@ -14,6 +14,7 @@ from ..benchmark import LH_MTLC, load_chains
 from ..calvin import CAMERAS, CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS, continuous_euler
 from ..desk import Desk, DeskError, Observation, SimulationError, Snapshot, is_fulfilled
 from ..desk.render import RENDERERS
+from ..desk.scenes import get_scene
 from ..desk.sentences import load_commands
 from ..desk.starts import sample_start
 from ..pictures import check_size
@@ -80,6 +81,7 @@ class CalvinEnv(gym.Env):
         sentence: `"first"`: a task is commanded by the first of its sentences, as in CALVIN. `"random"`: by any of
             them; the draws depend on the episode's seed.
         results_dir: If given, a line is appended to `episodes.jsonl` in it for every finished episode.
+        results_extra: Further entries of each line, such as the name of the policy.
         renderer: `"gl"` (the look of CALVIN's public data), `"tiny"`, `"pybullet_gl"` or `"pybullet_tiny"`; see `Desk`.
         perturbation_every: If not 0, every `perturbation_every`-th action is perturbed: each coordinate of its
             position difference is replaced by a draw from the normal distribution around it whose standard deviation
@@ -114,6 +116,7 @@ class CalvinEnv(gym.Env):
         annotations: str | None = None,
         sentence: str = "first",
         results_dir: str | None = None,
+        results_extra: dict[str, Any] | None = None,
         renderer: str = "gl",
         perturbation_every: int = 0,
         perturbation_scale: float = 0.0,
@@ -136,7 +139,7 @@ class CalvinEnv(gym.Env):
             raise DeskError(f"renderer {renderer!r} is unknown; choose among {', '.join(RENDERERS)}")
         check_size("render_size", render_size, LARGEST_RENDER)
         self.pictures = Pictures(tuple(cameras), image_size, depth, depth_unit, camera_poses)
-        self.task = task
+        self.task, self._scene = task, scene
         self.control_mode = control_mode
         self.sentence = sentence
         self.steps_per_command = steps_per_command
@@ -148,8 +151,8 @@ class CalvinEnv(gym.Env):
         self._render_size = render_size or CAMERAS["static"]
         self._redraw_every = max(1, round(CONTROL_HZ / render_fps))
         self._results_dir = None if results_dir is None else Path(results_dir)
+        self._results_extra = results_extra or {}
         self._sentences = load_commands(annotations, "validation")
-        self._max_episode_steps = steps_per_command * (CHAIN_LENGTH if task == LH_MTLC else 1)  # LeRobot asks for it
         self.task_description = "" if task == LH_MTLC else self._sentences[task][0]
         self._open_desk = functools.partial(Desk, scene, assets, self.pictures.cameras, renderer, depth)
         self._desk: Desk | None = None  # opened at the first reset, in the process that steps it
@@ -161,8 +164,19 @@ class CalvinEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts an episode; see the class for what `seed` decides. `options` are ignored."""
+        """Starts an episode; see the class for what `seed` decides.
+
+        Args:
+            seed: Of the episode.
+            options: `{"task": name}` changes the environment's task from this episode on.
+
+        Raises:
+            DeskError: The task is unknown, or cannot start in the scene.
+        """
         super().reset(seed=seed)
+        if options is not None and "task" in options:
+            _check_task(options["task"], self._scene)
+            self.task = options["task"]
         if self._desk is None:
             self._desk = self._open_desk()
         self._reason = None
@@ -243,6 +257,11 @@ class CalvinEnv(gym.Env):
         if self._desk is not None:
             self._desk.close()
             self._desk = None
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """LeRobot asks for it by this name."""
+        return self.steps_per_command * (CHAIN_LENGTH if self.task == LH_MTLC else 1)
 
     @property
     def _current(self) -> str:
@@ -326,6 +345,7 @@ class CalvinEnv(gym.Env):
             "perturbation_every": self.perturbation_every,
             "perturbation_scale": self.perturbation_scale,
             "version": version("lerobot_policy_lansar"),
+            **self._results_extra,
         }
         append_episode(self._results_dir, episode)
 
@@ -342,6 +362,7 @@ def _check_task(task: str, scene: str) -> None:
         raise DeskError(f"the benchmark's chains start in scene D, not {scene!r}; name a single task for {scene!r}")
     if scene == "D_eval":
         raise DeskError("scene 'D_eval' fixes the blocks, but an episode's task or chain places them; use 'D'")
+    get_scene(scene)
 
 
 def _check_numbers(steps_per_command: int, render_fps: int, perturbation_every: int, perturbation_scale: float) -> None:

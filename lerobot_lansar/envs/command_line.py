@@ -94,6 +94,15 @@ def trained_depth_unit() -> str:
     return _training_of(policy).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
 
 
+def evaluated_policy() -> str | None:
+    """`--policy.path` of the command: a name on the hub, or the folder that it leads to; None without one."""
+    policy = parser.get_path_arg("policy")
+    if policy is None or not Path(policy).is_dir():
+        return policy
+    folder = Path(policy).resolve()  # `checkpoints/last` is another folder tomorrow
+    return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
+
+
 def _training_of(policy: str) -> dict[str, Any]:
     """The options with which LeRobot trained a policy, from the file that it keeps beside it; empty without one."""
     file = Path(policy, TRAIN_CONFIG_NAME)

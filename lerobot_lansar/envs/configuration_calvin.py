@@ -17,7 +17,13 @@ from ..desk import Desk
 from ..desk.render import OURS
 from ..pictures import check_size
 from .calvin import LARGEST_RENDER, CalvinEnv
-from .command_line import check_environment_state, check_pictures, refuse_recording, trained_depth_unit
+from .command_line import (
+    check_environment_state,
+    check_pictures,
+    evaluated_policy,
+    refuse_recording,
+    trained_depth_unit,
+)
 from .pictures import Pictures, camera_keys, depth_key
 from .spaces import ACTION_SIZE, environment_state_size
 from .suites import suites
@@ -90,7 +96,7 @@ class CalvinEnvConfig(EnvConfig):
                 f"--env.fps must be {CONTROL_HZ}, got {self.fps}: the desk makes {CONTROL_HZ} control steps per "
                 "second, as CALVIN does. --env.render_fps sets how many pictures per second the videos have"
             )
-        self._suites()
+        self.suites()
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_SIZE,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(ROBOT_OBS_NAMES),)),
@@ -154,7 +160,8 @@ class CalvinEnvConfig(EnvConfig):
             "render_size",
         )
         unit = self.depth_unit or (trained_depth_unit() if self.depth else DEFAULT_DEPTH_UNIT)
-        return {**{name: getattr(self, name) for name in names}, "depth_unit": unit}
+        results_extra = {"policy": evaluated_policy(), "policy_reset": "batch"}
+        return {**{name: getattr(self, name) for name in names}, "depth_unit": unit, "results_extra": results_extra}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Processors that change nothing. LeRobot asks for them before the first step, in training too.
@@ -164,7 +171,7 @@ class CalvinEnvConfig(EnvConfig):
                 `--env.task_in_state`, or on pictures of another size, or on depth. Or the command records what LeRobot
                 would mix up or cannot store.
         """
-        refuse_recording(mixed=self.sentence == "random" or LH_MTLC in self._suites(), depth=self.depth)
+        refuse_recording(mixed=self.sentence == "random" or LH_MTLC in self.suites(), depth=self.depth)
         check_environment_state(self.task_in_state)
         check_pictures(self._pictures())
         return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[])
@@ -175,9 +182,10 @@ class CalvinEnvConfig(EnvConfig):
         Finished episodes freeze instead of being simulated further. The workers of the first task are forked here,
         which in `lerobot-eval` is before the policy exists, those of the others when their turn comes.
         """
+        make = functools.partial(CalvinEnv, **self.gym_kwargs)
         makers = {
-            suite: [[functools.partial(CalvinEnv, task=task, **self.gym_kwargs)] * n_envs for task in tasks]
-            for suite, tasks in self._suites().items()
+            suite: [[functools.partial(make, task=task)] * n_envs for task in tasks]
+            for suite, tasks in self.suites().items()
         }
         if not use_async_envs or n_envs == 1:
             return {suite: dict(enumerate(map(SerialVectorEnv, made))) for suite, made in makers.items()}
@@ -188,5 +196,6 @@ class CalvinEnvConfig(EnvConfig):
         next(iter(envs.values()))[0]._ensure()
         return {suite: dict(enumerate(made)) for suite, made in envs.items()}
 
-    def _suites(self) -> dict[str, tuple[str, ...]]:
+    def suites(self) -> dict[str, tuple[str, ...]]:
+        """The tasks of `--env.task` by suite, the name by which LeRobot groups its results."""
         return suites(self.task or LH_MTLC)

@@ -1,8 +1,9 @@
 """`episodes.jsonl`: what became of each episode, written by all environments of an evaluation into one file."""
 
 import json
+import os
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from filelock import FileLock
 
@@ -15,11 +16,41 @@ LOCK_FILE = f".{EPISODES_FILE}.lock"
 def append_episode(folder: Path, episode: dict[str, Any]) -> None:
     """Appends one whole line to the folder's `episodes.jsonl`; safe while other processes do the same.
 
+    The beginning of a line that a killed process left at the end of the file is removed.
+
     Args:
         folder: Made if missing.
         episode: JSON; `CalvinEnv` decides what it holds.
     """
     line = json.dumps(episode) + "\n"
     folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / LOCK_FILE), open(folder / EPISODES_FILE, "a") as file:
-        file.write(line)
+    with FileLock(folder / LOCK_FILE), open(folder / EPISODES_FILE, "a+b") as file:
+        file.truncate(_whole_lines(file))
+        file.write(line.encode())
+
+
+def read_episodes(folder: Path) -> list[dict[str, Any]]:
+    """The lines of a folder's `episodes.jsonl`, without the beginning of one that a killed process left at its end.
+
+    Raises:
+        ValueError: A line is damaged.
+    """
+    file = folder / EPISODES_FILE
+    lines = file.read_text().split("\n")[:-1] if file.is_file() else []
+    try:
+        return [json.loads(line) for line in lines]
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+
+
+def _whole_lines(file: BinaryIO) -> int:
+    """How many bytes of a file are whole lines."""
+    end = file.seek(0, os.SEEK_END)
+    while end:
+        start = max(0, end - 4096)
+        file.seek(start)
+        newline = file.read(end - start).rfind(b"\n")
+        if newline >= 0:
+            return start + newline + 1
+        end = start
+    return 0

@@ -48,6 +48,7 @@ def run_shards(
     total: int,
     unit: str,
     desc: str = "recording",
+    status: Callable[[], str] = str,
 ) -> bool:
     """Calls `work` for every shard and `finish` once after them.
 
@@ -61,6 +62,7 @@ def run_shards(
         logging_dir: Where Slurm's and Ray's logs are kept.
         progress: Returns how many of `total` units are done, for the progress bar.
         total, unit, desc: The progress bar's length, unit and title.
+        status: Returns what the progress bar says at its end.
 
     Returns:
         True when all work is done, False when jobs were submitted that run without this process.
@@ -76,7 +78,7 @@ def run_shards(
         if executor == "slurm":
             cluster.submit_to_slurm(work, shards, finish, workers, slurm, logging_dir)
             return False
-    with _progress_bar(progress, total, unit, desc):
+    with _progress_bar(progress, status, total, unit, desc):
         if executor == "ray":
             cluster.run_on_ray(work, shards, workers, logging_dir)
         else:
@@ -156,14 +158,18 @@ def _follow_parent() -> None:
 
 
 @contextmanager
-def _progress_bar(progress: Callable[[], int], total: int, unit: str, desc: str) -> Iterator[None]:
+def _progress_bar(
+    progress: Callable[[], int], status: Callable[[], str], total: int, unit: str, desc: str
+) -> Iterator[None]:
     ended = threading.Event()
 
     def watch() -> None:
         with tqdm(total=total, initial=progress(), desc=desc, unit=unit) as bar:
-            while not ended.wait(0.5):
+            is_last = False
+            while not is_last:
+                is_last = ended.wait(0.5)
+                bar.set_postfix_str(status(), refresh=False)
                 bar.update(progress() - bar.n)
-            bar.update(progress() - bar.n)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -1,0 +1,240 @@
+"""`lansar-eval`: LeRobot's evaluation on the desk in several processes; an interrupted one goes on where it stopped.
+
+Each finished episode has a line in OUTPUT_DIR/episodes.jsonl. Episodes that have one are not played again.
+"""
+
+import hashlib
+import json
+import os
+import shlex
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+from filelock import FileLock, Timeout
+from lerobot.configs import parser
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from ..benchmark import EPISODES_FILE, LH_MTLC
+from ..calvin import CHAIN_LENGTH
+from ..command import CommandError, run_command
+from ..envs.episodes import read_episodes
+from ..jobs.executors import run_shards
+from ..jobs.staging import write_atomically
+from .options import EvaluateConfig
+from .stream import Episode
+from .worker import evaluate_shard, finished, line_task
+
+CONFIG_FILE = "eval_config.json"
+"""File in OUTPUT_DIR: which evaluation its lines belong to, for `lansar-report` and for the next run."""
+
+_LOCK = ".lansar-eval.lock"
+_MAY_CHANGE = ("output_dir", "job_name", "workers", "executor", "slurm", "chains", "videos", "eval")
+"""Options that decide no episode's result."""
+
+
+def evaluate(config: EvaluateConfig) -> Path:
+    """Plays the missing episodes.
+
+    What an episode's line says depends on the policy, the options and the seed, not on the number of workers or on
+    interruptions. (LanSAR computes the same to the last digit for batches of 4 and more on a CPU.)
+
+    Returns:
+        The output folder, with `episodes.jsonl`, `eval_config.json`, videos and, when all episodes are played,
+        LeRobot's `eval_info.json`.
+
+    Raises:
+        ValueError, CommandError: An option is wrong, or the folder holds another evaluation.
+        WorkerDied: A worker was killed.
+    """
+    config.check()
+    folder = config.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / _LOCK, timeout=3):
+            return _evaluate(config)
+    except Timeout:
+        raise CommandError(f"another process is evaluating into {folder}: wait for it or stop it") from None
+
+
+def _evaluate(config: EvaluateConfig) -> Path:
+    folder, desk = config.folder, config.desk
+    env_options = desk.gym_kwargs | {"results_dir": str(folder)}
+    env_options["results_extra"] = {**env_options["results_extra"], "policy_reset": "command"}
+    if desk.assets is not None:
+        env_options["assets"] = str(Path(desk.assets).resolve())
+    _claim(config, env_options["results_extra"]["policy"])
+    episodes = planned(config)
+    done = finished(config)
+    missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
+    started = time.time()
+    config.workers = min(config.workers or 1, max(1, len(missing)))
+    complete = run_shards(
+        (evaluate_shard, (config, env_options, missing)),
+        config.workers if missing else 0,
+        (write_eval_info, (config, started)),
+        executor=config.executor if missing else "local",
+        workers=config.workers,
+        slurm=config.slurm,
+        logging_dir=folder / "logs",
+        progress=lambda: len(_counted(config)),
+        total=len(episodes),
+        unit="chain" if list(desk.suites()) == [LH_MTLC] else "episode",
+        desc="evaluating",
+        status=lambda: _mean(_counted(config), desk.suites()),
+    )
+    if not complete:
+        print(f"submitted; {folder / 'eval_info.json'} appears when the jobs are done")
+    return folder
+
+
+def planned(config: EvaluateConfig) -> list[Episode]:
+    """All episodes of an evaluation, with the seeds and names of videos that LeRobot gives them."""
+    assert config.seed is not None
+    found = []
+    for suite, tasks in config.desk.suites().items():
+        for number, task in enumerate(tasks):
+            videos = config.folder / "videos" / f"{suite}_{number}"
+            for k in range(config.eval.n_episodes):
+                video = videos / f"eval_episode_{k}.mp4" if k < config.videos else None
+                found.append(Episode(task, config.seed + k, video))
+    return found
+
+
+def _counted(config: EvaluateConfig) -> list[dict[str, Any]]:
+    """The lines of planned episodes, one each; an earlier run may have played more."""
+    wanted = {(episode.task, episode.seed) for episode in planned(config)}
+    lines = {(line_task(line), line["seed"]): line for line in read_episodes(config.folder)}
+    return [line for key, line in lines.items() if key in wanted]
+
+
+def _mean(lines: list[dict[str, Any]], suites: dict[str, tuple[str, ...]]) -> str:
+    if not lines:
+        return ""
+    mean = float(np.mean([line["successes"] for line in lines]))
+    return f"average length {mean:.2f}" if list(suites) == [LH_MTLC] else f"successes {mean:.3f}"
+
+
+def _claim(config: EvaluateConfig, policy: str | None) -> None:
+    """Makes the folder that of this evaluation.
+
+    Raises:
+        CommandError: It is that of another one.
+    """
+    file = config.folder / CONFIG_FILE
+    request = _request(config)
+    if file.exists():
+        before = json.loads(file.read_text())["request"]
+        if before != request:
+            others = ", ".join(_differences(before, request))
+            raise CommandError(
+                f"{config.folder} holds another evaluation, which differs in {others}: give another --output_dir, or "
+                f"repeat its options ({file})"
+            )
+    elif (config.folder / EPISODES_FILE).exists():
+        raise CommandError(f"{config.folder} holds episodes of another evaluation: give another --output_dir")
+    described = {
+        "policy": policy,
+        "seed": config.seed,
+        "n_episodes": config.eval.n_episodes,
+        "suites": config.desk.suites(),
+        "command": shlex.join(["lansar-eval", *sys.argv[1:]]),
+        "hardware": f"{len(os.sched_getaffinity(0))} CPU cores, policy on {config.policy and config.policy.device}",
+        "version": version("lerobot_policy_lansar"),
+        "request": request,
+    }
+    write_atomically(file, json.dumps(described, indent=2) + "\n")
+
+
+def _request(config: EvaluateConfig) -> dict[str, Any]:
+    """What decides the results: options, and the policy's weights where they lie on this machine."""
+    options = {key: value for key, value in draccus.encode(config).items() if key not in _MAY_CHANGE}
+    assert config.policy is not None
+    weights = Path(str(config.policy.pretrained_path), "model.safetensors")
+    if weights.is_file():
+        with open(weights, "rb") as file:
+            options["weights_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return json.loads(json.dumps(options))
+
+
+def _differences(one: Any, other: Any, name: str = "-") -> list[str]:
+    """Names of the options in which two requests differ."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        keys = [*one, *(key for key in other if key not in one)]
+        sub = (_differences(one.get(k), other.get(k), f"{name}{'-' if name == '-' else '.'}{k}") for k in keys)
+        return [difference for found in sub for difference in found]
+    return [] if one == other else [name]
+
+
+def write_eval_info(config: EvaluateConfig, started: float, _: int = 0) -> None:
+    """Writes `eval_info.json` as LeRobot does, from the lines.
+
+    Args:
+        config: The command's options.
+        started: When the command began, in seconds since the epoch.
+    """
+    lines = {(line_task(line), line["seed"]): line for line in _counted(config)}
+    per_task: list[dict[str, Any]] = []
+    groups = {}
+    for suite, tasks in config.desk.suites().items():
+        for number, task in enumerate(tasks):
+            mine = [episode for episode in planned(config) if episode.task == task]
+            rows = [lines[task, episode.seed] for episode in mine]
+            metrics = {
+                "sum_rewards": [float(row["successes"]) for row in rows],
+                "max_rewards": [float(row["successes"] > 0) for row in rows],
+                "successes": [_is_success(row) for row in rows],
+                "video_paths": [str(e.video) for e in mine if e.video is not None and e.video.is_file()],
+                "predicted_video_paths": [],
+            }
+            per_task.append({"task_group": suite, "task_id": number, "metrics": metrics})
+        groups[suite] = _aggregated([entry["metrics"] for entry in per_task if entry["task_group"] == suite])
+    overall = _aggregated([entry["metrics"] for entry in per_task])
+    seconds = time.time() - started
+    overall |= {"eval_s": seconds, "eval_ep_s": seconds / overall["n_episodes"]}
+    info = {"per_task": per_task, "per_group": groups, "overall": overall}
+    write_atomically(config.folder / "eval_info.json", json.dumps(info, indent=2) + "\n")
+
+
+def _is_success(line: dict[str, Any]) -> bool:
+    wanted = CHAIN_LENGTH if line["chain"] is not None else 1
+    return line["successes"] == wanted
+
+
+def _aggregated(metrics: list[dict[str, Any]]) -> dict[str, Any]:
+    rewards, largest, successes, videos = (
+        [value for each in metrics for value in each[key]]
+        for key in ("sum_rewards", "max_rewards", "successes", "video_paths")
+    )
+    return {
+        "avg_sum_reward": float(np.mean(rewards)),
+        "avg_max_reward": float(np.mean(largest)),
+        "pc_success": 100 * float(np.mean(successes)),
+        "n_episodes": len(rewards),
+        "video_paths": videos,
+        "predicted_video_paths": [],
+    }
+
+
+@parser.wrap()
+def run(config: EvaluateConfig) -> None:
+    """Evaluates and says what to do next."""
+    folder = evaluate(config)
+    print(f"lansar-report --eval_dir={os.path.relpath(folder)} makes the tables")
+
+
+def main() -> int:
+    """Entry point of `lansar-eval`."""
+    register_third_party_plugins()
+    return run_command("lansar-eval", run, resumable=True)
+
+
+if __name__ == "__main__":
+    # jobs on other machines import these functions by their module's real name, which is not __main__
+    from lerobot_lansar.evaluation.evaluate import main as run_main
+
+    sys.exit(run_main())

@@ -1,0 +1,99 @@
+"""A policy that is reset in each environment where a command begins, as CALVIN's benchmark does."""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor, nn
+
+from .stream import EpisodeStream
+
+
+class ResetAtCommands(nn.Module):
+    """A policy in LeRobot's `rollout`, which itself resets a policy once per batch of episodes.
+
+    LanSAR keeps a history for each environment and can clear one of them (`reset_environments`). Other policies keep
+    one queue of predicted actions for the whole batch: each environment gets a copy of its own, which shares the
+    weights, and a random generator of its own, so that what a copy does depends on its episode alone.
+
+    Args:
+        policy: In evaluation mode.
+        streams: The environments of the batch, in order.
+    """
+
+    def __init__(self, policy: PreTrainedPolicy, streams: Sequence[EpisodeStream]):
+        super().__init__()
+        self._policy, self._streams = policy, streams
+        self._begun = [0] * len(streams)
+        self._in_batch = hasattr(policy, "reset_environments")
+        self._copies = [] if self._in_batch else [_Copy(policy) for _ in streams]
+
+    def reset(self) -> None:
+        """Called by `rollout` before the first step, when nothing has been played yet."""
+        self._policy.reset()
+
+    def select_action(self, batch: dict[str, Any]) -> Tensor:
+        """(B, 7) actions; see the policy's own."""
+        new = [i for i, stream in enumerate(self._streams) if stream.commands != self._begun[i]]
+        self._begun = [stream.commands for stream in self._streams]
+        if self._in_batch:
+            self._policy.reset_environments(new)  # type: ignore[operator]
+            return self._policy.select_action(batch)
+        for i in new:
+            self._copies[i].begin(self._streams[i])
+        rows = [each.select_action(_row(batch, i, len(self._streams))) for i, each in enumerate(self._copies)]
+        return torch.cat(rows)
+
+
+class _Copy:
+    """A policy for one environment."""
+
+    def __init__(self, policy: PreTrainedPolicy):
+        shared = {id(parameter): parameter for parameter in policy.parameters()}
+        self._policy = copy.deepcopy(policy, shared)
+        device = torch.device(policy.config.device or "cpu")
+        self._devices = [device] if device.type == "cuda" else []
+        self._playing: Any = None
+        self._stream: EpisodeStream | None = None
+        self._random: list[Tensor] = []
+        self._last: Tensor | None = None
+
+    def begin(self, stream: EpisodeStream) -> None:
+        """Begins a command, which may be an episode's first."""
+        self._policy.reset()
+        self._stream = stream
+        if stream.episode is not None and stream.episode is not self._playing:
+            self._playing = stream.episode
+            with torch.random.fork_rng(self._devices):
+                torch.manual_seed(stream.episode.seed)
+                self._random = self._states()
+
+    def select_action(self, batch: dict[str, Any]) -> Tensor:
+        """(1, 7) the action; the last one again when there is no episode left."""
+        assert self._stream is not None
+        if self._stream.episode is None and self._last is not None:
+            return self._last
+        with torch.random.fork_rng(self._devices):
+            torch.set_rng_state(self._random[0])
+            for device, state in zip(self._devices, self._random[1:], strict=True):
+                torch.cuda.set_rng_state(state, device)
+            self._last = self._policy.select_action(batch)
+            self._random = self._states()
+        return self._last
+
+    def _states(self) -> list[Tensor]:
+        return [torch.get_rng_state(), *(torch.cuda.get_rng_state(device) for device in self._devices)]
+
+
+def _row(batch: dict[str, Any], i: int, rows: int) -> dict[str, Any]:
+    """One environment's part of a batch."""
+    return {
+        key: value[i : i + 1] if isinstance(value, Tensor | list) and _length(value) == rows else value
+        for key, value in batch.items()
+    }
+
+
+def _length(value: Tensor | list) -> int:
+    return 0 if isinstance(value, Tensor) and value.ndim == 0 else len(value)

@@ -1,0 +1,82 @@
+"""One process of `lansar-eval`: LeRobot's `rollout` over its share of the episodes."""
+
+import logging
+import os
+from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
+
+import torch
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.device_utils import get_safe_torch_device
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.random_utils import set_seed
+
+from ..benchmark import LH_MTLC
+from ..calvin import CHAIN_LENGTH
+from ..envs import CalvinEnv
+from ..envs.episodes import read_episodes
+from ..envs.vector import SerialVectorEnv
+from .loading import load_policy
+from .options import EvaluateConfig
+from .rows import ResetAtCommands
+from .stream import Episode, EpisodeStream
+
+LOGS = "logs"
+"""Folder in `--output_dir` for what LeRobot prints in each worker."""
+
+
+def evaluate_shard(config: EvaluateConfig, env_options: dict, episodes: Sequence[Episode], shard: int) -> None:
+    """Plays every `workers`-th of the episodes from number `shard` on, but those that have a line by now.
+
+    Args:
+        config: The command's options.
+        env_options: Arguments of `CalvinEnv`.
+        episodes: All that were missing when the command began.
+        shard: The worker's number.
+    """
+    assert config.workers is not None
+    done = finished(config)
+    mine = [episode for episode in episodes[shard :: config.workers] if (episode.task, episode.seed) not in done]
+    if not mine:
+        return
+    log = config.folder / LOGS / f"worker_{shard}.log"
+    log.parent.mkdir(exist_ok=True)
+    with open(log, "w") as file, redirect_stdout(file), redirect_stderr(file):
+        _evaluate(config, env_options, mine)
+
+
+def finished(config: EvaluateConfig) -> set[tuple[str, int]]:
+    """Task and seed of every episode that has a line."""
+    lines = read_episodes(config.folder)
+    return {(line_task(line), line["seed"]) for line in lines}
+
+
+def line_task(line: dict) -> str:
+    """The `task` of `CalvinEnv` that a line of `episodes.jsonl` is of."""
+    return line["commands"][0]["task"] if line["chain"] is None else LH_MTLC
+
+
+def _evaluate(config: EvaluateConfig, env_options: dict, episodes: list[Episode]) -> None:
+    assert config.policy is not None
+    assert config.workers is not None
+    register_third_party_plugins()
+    logging.getLogger().setLevel(logging.WARNING)
+    device = get_safe_torch_device(str(config.policy.device))
+    torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) // config.workers))
+    torch.backends.cudnn.benchmark = True
+    torch.backends.cuda.matmul.allow_tf32 = True
+    set_seed(config.seed)
+    policy, processors = load_policy(config.policy, config.desk, config.rename_map)
+    longest = len(episodes) * CHAIN_LENGTH * config.desk.steps_per_command + 1
+    queue = iter(episodes)
+    streams = [
+        EpisodeStream(CalvinEnv(**env_options), queue, longest, config.desk.render_fps)
+        for _ in range(min(config.eval.batch_size, len(episodes)))
+    ]
+    env = SerialVectorEnv([lambda stream=stream: stream for stream in streams])  # type: ignore[misc]
+    precision = torch.autocast(device.type) if config.policy.use_amp else nullcontext()
+    try:
+        with torch.no_grad(), precision:
+            rollout(env, ResetAtCommands(policy, streams), *processors)  # type: ignore[arg-type]
+    finally:
+        env.close()
