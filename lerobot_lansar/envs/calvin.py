@@ -219,7 +219,8 @@ class CalvinEnv(gym.Env):
         fulfilled, finished = self._judge()
         info = self._info()
         if finished:
-            self._write_result()
+            if self._results_dir is not None:
+                append_episode(self._results_dir, self.result())
             self._commands = ()
         elif fulfilled:
             self._begin_command()
@@ -325,11 +326,10 @@ class CalvinEnv(gym.Env):
         """How many commands the episode has fulfilled."""
         return sum(outcome["success"] for outcome in self._outcomes)
 
-    def _write_result(self) -> None:
-        if self._results_dir is None:
-            return
+    def result(self) -> dict[str, Any]:
+        """The line of `episodes.jsonl` that describes the episode: what was commanded, what became of it, settings."""
         assert self._desk is not None
-        episode = {
+        return {
             "seed": self._seed,
             "chain": self._chain,
             "scene": self._desk.scene.name,
@@ -347,7 +347,6 @@ class CalvinEnv(gym.Env):
             "version": version("lerobot_policy_lansar"),
             **self._results_extra,
         }
-        append_episode(self._results_dir, episode)
 
 
 def _is_action(action: Any) -> bool:

@@ -63,7 +63,7 @@ def evaluate(config: EvaluateConfig) -> Path:
 
 def _evaluate(config: EvaluateConfig) -> Path:
     folder, desk = config.folder, config.desk
-    env_options = desk.gym_kwargs | {"results_dir": str(folder)}
+    env_options = desk.gym_kwargs
     env_options["results_extra"] = {**env_options["results_extra"], "policy_reset": "command"}
     if desk.assets is not None:
         env_options["assets"] = str(Path(desk.assets).resolve())

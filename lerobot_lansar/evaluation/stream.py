@@ -11,6 +11,7 @@ from lerobot.utils.io_utils import write_video
 
 from ..calvin import CONTROL_HZ
 from ..envs import CalvinEnv
+from ..envs.episodes import append_episode
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,9 @@ class EpisodeStream(gym.Wrapper):
     the mean. Here an environment begins the next episode at once.
 
     Args:
-        env: It writes the result of each episode into `episodes.jsonl`.
+        env: Without `results_dir`.
         episodes: Shared by all environments of the batch: each takes the next one. There is at least one for each.
+        results_dir: Each episode gets a line in `episodes.jsonl` there, when its video is written.
         longest: Steps after which `rollout` may stop: more than all episodes can take.
         render_fps: About how many pictures per second a video has.
 
@@ -45,11 +47,11 @@ class EpisodeStream(gym.Wrapper):
         commands: How many commands have begun, in all episodes.
     """
 
-    def __init__(self, env: CalvinEnv, episodes: Iterator[Episode], longest: int, render_fps: int):
+    def __init__(self, env: CalvinEnv, episodes: Iterator[Episode], results_dir: Path, longest: int, render_fps: int):
         super().__init__(env)
         self.episode: Episode | None = None
         self.commands = 0
-        self._episodes = episodes
+        self._episodes, self._results_dir = episodes, results_dir
         self._max_episode_steps = longest
         self._film_every = max(1, round(CONTROL_HZ / render_fps))
         self._frames: list[np.ndarray] = []
@@ -68,7 +70,7 @@ class EpisodeStream(gym.Wrapper):
         if not terminated:
             self.commands += int(float(reward))
             return observation, float(reward), False, False, info
-        self._save_video()
+        self._save()
         started = self._begin()
         if started is None:
             return observation, float(reward), True, False, info
@@ -92,10 +94,12 @@ class EpisodeStream(gym.Wrapper):
                 self._frames.append(self.env.render())  # type: ignore[arg-type]
             self._steps += 1
 
-    def _save_video(self) -> None:
+    def _save(self) -> None:
+        """Writes the episode's video and line. The line comes last: an episode that has one is not played again."""
         if self.episode is not None and self.episode.video is not None:
             file = self.episode.video
             file.parent.mkdir(parents=True, exist_ok=True)
             partial = file.with_name(f".{file.name}")
             write_video(partial, self._frames, round(CONTROL_HZ / self._film_every))
             partial.rename(file)
+        append_episode(self._results_dir, self.unwrapped.result())  # type: ignore[attr-defined]

@@ -70,7 +70,7 @@ def _evaluate(config: EvaluateConfig, env_options: dict, episodes: list[Episode]
     longest = len(episodes) * CHAIN_LENGTH * config.desk.steps_per_command + 1
     queue = iter(episodes)
     streams = [
-        EpisodeStream(CalvinEnv(**env_options), queue, longest, config.desk.render_fps)
+        EpisodeStream(CalvinEnv(**env_options), queue, config.folder, longest, config.desk.render_fps)
         for _ in range(min(config.eval.batch_size, len(episodes)))
     ]
     env = SerialVectorEnv([lambda stream=stream: stream for stream in streams])  # type: ignore[misc]

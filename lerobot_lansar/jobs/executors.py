@@ -162,14 +162,14 @@ def _progress_bar(
     progress: Callable[[], int], status: Callable[[], str], total: int, unit: str, desc: str
 ) -> Iterator[None]:
     ended = threading.Event()
+    bar = tqdm(total=total, initial=progress(), desc=desc, unit=unit)  # here, where nobody has redirected stderr yet
 
     def watch() -> None:
-        with tqdm(total=total, initial=progress(), desc=desc, unit=unit) as bar:
-            is_last = False
-            while not is_last:
-                is_last = ended.wait(0.5)
-                bar.set_postfix_str(status(), refresh=False)
-                bar.update(progress() - bar.n)
+        is_last = False
+        while not is_last:
+            is_last = ended.wait(0.5)
+            bar.set_postfix_str(status(), refresh=False)
+            bar.update(progress() - bar.n)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -178,3 +178,4 @@ def _progress_bar(
     finally:
         ended.set()
         thread.join()
+        bar.close()

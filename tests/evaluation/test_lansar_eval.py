@@ -1,0 +1,178 @@
+"""`lansar-eval`: in any number of processes, killed and resumed, the same episodes with the same results."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_lansar.benchmark import EPISODES_FILE, load_chains
+
+COMMON = [
+    "--policy.device=cpu",
+    "--env.type=calvin",
+    "--env.cameras=[]",
+    "--env.steps_per_command=60",
+    "--env.render_fps=1",
+    "--seed=4",
+]
+
+
+def command(name, checkpoint, folder, *options):
+    script = Path(sys.executable).with_name(name)
+    return [script, f"--policy.path={checkpoint}", f"--output_dir={folder}", *COMMON, *options]
+
+
+def run(*arguments):
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
+    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=600, env=environment)
+
+
+def lines(folder):
+    return [json.loads(line) for line in (folder / EPISODES_FILE).read_text().splitlines()]
+
+
+def results(folder):
+    """What happened in each episode, by seed."""
+    found = {line["seed"]: [(c["task"], c["success"], c["steps"]) for c in line["commands"]] for line in lines(folder)}
+    assert len(found) == len(lines(folder)), "no episode was played twice"
+    return found
+
+
+def filmed(folder):
+    """The last picture of each video, by its name."""
+    import av
+
+    found = {}
+    for file in sorted((folder / "videos").rglob("*.mp4")):
+        with av.open(str(file)) as container:
+            *_, last = container.decode(video=0)
+            found[file.relative_to(folder)] = last.to_ndarray(format="rgb24").astype(float)
+    return found
+
+
+def kill_a_worker(parent):
+    """Kills one of the processes that a running command has started; returns the command's exit code."""
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+    workers = [int(c) for c in children if "spawn_main" in Path(f"/proc/{c}/cmdline").read_text()]
+    os.kill(workers[-1], signal.SIGKILL)
+    return parent.wait(timeout=60)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(checkpoint, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("one") / "eval"
+    done = run("lansar-eval", checkpoint, folder, "--chains=8", "--workers=1", "--eval.batch_size=3", "--videos=3")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "average length" in done.stderr
+    return folder
+
+
+def test_a_killed_evaluation_goes_on_with_the_same_results(checkpoint, undisturbed, tmp_path):
+    folder = tmp_path / "eval"
+    options = ["--chains=8", "--workers=2", "--eval.batch_size=2", "--videos=3"]
+    begun = subprocess.Popen(command("lansar-eval", checkpoint, folder, *options), stderr=subprocess.PIPE, text=True)
+    file, deadline = folder / EPISODES_FILE, time.time() + 300
+    while not file.exists() and time.time() < deadline and begun.poll() is None:
+        time.sleep(0.02)
+    assert kill_a_worker(begun) == 2
+    assert "a worker process was killed" in begun.stderr.read()
+    before = file.read_bytes()
+    assert 1 <= before.count(b"\n") < 8
+    assert not (folder / "eval_info.json").exists()
+    file.write_bytes(before + b'{"seed": 11, "chain"')  # as if it had been killed while it wrote
+    done = run("lansar-eval", checkpoint, folder, *options)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert file.read_bytes().startswith(before), "finished episodes stay as they were"
+    assert results(folder) == results(undisturbed)
+    pictures, expected = filmed(folder), filmed(undisturbed)
+    assert [str(name) for name in expected] == [f"videos/lh_mtlc_0/eval_episode_{k}.mp4" for k in range(3)]
+    for name, picture in expected.items():
+        assert np.abs(pictures[name] - picture).mean() < 1, "the arm went elsewhere"
+
+
+def test_the_lines_say_what_was_evaluated(checkpoint, undisturbed):
+    assert sorted(results(undisturbed)) == list(range(4, 12))
+    for line in lines(undisturbed):
+        assert line["commands"][0]["task"] == load_chains()[line["chain"]].tasks[0]
+        assert (line["policy"], line["policy_reset"]) == (str(checkpoint), "command")
+    described = json.loads((undisturbed / "eval_config.json").read_text())
+    assert (described["policy"], described["seed"], described["n_episodes"]) == (str(checkpoint), 4, 8)
+    assert described["suites"] == {"lh_mtlc": ["lh_mtlc"]}
+    assert described["command"].startswith("lansar-eval --policy.path=")
+
+
+def test_more_chains_are_added_to_those_that_were_played(checkpoint, undisturbed):
+    before = (undisturbed / EPISODES_FILE).read_bytes()
+    done = run("lansar-eval", checkpoint, undisturbed, "--chains=10", "--workers=1", "--eval.batch_size=3")
+    assert done.returncode == 0, done.stderr[-3000:]
+    after = (undisturbed / EPISODES_FILE).read_bytes()
+    assert after.startswith(before)
+    assert after.count(b"\n") == 10
+    assert json.loads((undisturbed / "eval_info.json").read_text())["overall"]["n_episodes"] == 10
+    again = run("lansar-eval", checkpoint, undisturbed, "--chains=10")
+    assert again.returncode == 0
+    assert (undisturbed / EPISODES_FILE).read_bytes() == after, "nothing was missing"
+
+
+def test_its_eval_info_is_lerobots(checkpoint, tmp_path):
+    options = ["--env.task=drawer,turn_on_led", "--env.steps_per_command=5", "--eval.n_episodes=2"]
+    found = {}
+    for name, more in (
+        ("lerobot-eval", ["--eval.batch_size=2", "--eval.use_async_envs=false", "--env.results_dir=/dev/null/no"]),
+        ("lansar-eval", ["--workers=1"]),
+    ):
+        folder = tmp_path / name
+        if name == "lerobot-eval":
+            more = [*more[:-1], f"--env.results_dir={folder}"]
+        done = run(name, checkpoint, folder, *options, *more)
+        assert done.returncode == 0, done.stderr[-3000:]
+        found[name] = json.loads((folder / "eval_info.json").read_text())
+        for entry in (*found[name]["per_task"], *found[name]["per_group"].values(), found[name]["overall"]):
+            numbers = entry.get("metrics", entry)
+            numbers["video_paths"] = [str(Path(path).relative_to(folder)) for path in numbers["video_paths"]]
+        found[name]["overall"] |= {"eval_s": 0, "eval_ep_s": 0}
+        resets = {line["policy_reset"] for line in lines(folder)}
+        assert resets == {"batch" if name == "lerobot-eval" else "command"}
+    assert found["lansar-eval"] == found["lerobot-eval"]
+
+
+REFUSED = [
+    (["--chains=8", "--env.control_mode=abs"], "differs in --env.control_mode: give another --output_dir"),
+    (["--chains=8", "--seed=5"], "differs in --seed"),
+    (["--chains=0"], "--eval.n_episodes must be at least 1, got 0"),
+    (["--chains=8", "--env.task=open_drawer"], "--chains counts chains of the benchmark"),
+    (["--chains=8", "--env.results_dir=elsewhere"], "leave out --env.results_dir"),
+    (["--chains=8", "--workers=0"], "--workers must be at least 1"),
+    (["--chains=8", "--executor=slurm"], "--executor=slurm needs Slurm's sbatch"),
+    (["--chains=8", "--eval.recording=true"], "works with lerobot-eval only"),
+]
+
+IN_TURN = """
+import contextlib, io, json, sys
+from lerobot_lansar.evaluation import evaluate
+for arguments in json.loads(sys.argv[1]):
+    sys.argv = ["lansar-eval", *arguments]
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said):
+        code = evaluate.main()
+    print(json.dumps([code, said.getvalue()]))
+"""
+
+
+def test_what_cannot_be_done_is_refused_in_one_message(checkpoint, undisturbed):
+    before = {path: path.stat().st_mtime for path in undisturbed.rglob("*")}
+    calls = [list(map(str, command("lansar-eval", checkpoint, undisturbed, *options)[1:])) for options, _ in REFUSED]
+    done = subprocess.run([sys.executable, "-c", IN_TURN, json.dumps(calls)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for (options, expected), printed in zip(REFUSED, done.stdout.splitlines(), strict=True):
+        code, said = json.loads(printed)
+        assert code == 2, options
+        assert expected in said, options
+    after = {path: path.stat().st_mtime for path in undisturbed.rglob("*") if not path.name.endswith(".lock")}
+    assert {path: time for path, time in before.items() if path in after} == after
