@@ -1,6 +1,7 @@
 """What all tests share: an offline LeRobot, and where the recordings of the original simulator are."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,3 +31,31 @@ def golden() -> Path:
 def original_assets() -> Path:
     """The original CALVIN asset files."""
     return _shared("calvin_assets")
+
+
+SBATCH = """#!/usr/bin/env python3
+import os, re, subprocess, sys
+script = open(sys.argv[-1]).read()
+array = re.search(r"--array=(\\d+)-(\\d+)", script)
+for index in range(int(array[1]), int(array[2]) + 1):
+    environment = {
+        **os.environ, "SLURM_ARRAY_TASK_ID": str(index), "SLURM_NODELIST": "here"
+    }
+    subprocess.run(["bash", sys.argv[-1]], env=environment, stdout=sys.stderr, stderr=sys.stderr)
+print("Submitted batch job 42")
+"""
+
+SRUN = """#!/bin/sh
+shift 3
+exec "$@"
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path):
+    """A PATH on which scripts stand in for Slurm's commands; they run the arrays that datatrove submits, job scripts
+    and all, here."""
+    for name, text in (("sbatch", SBATCH), ("srun", SRUN), ("scontrol", "#!/bin/sh\necho here\n")):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    return f"{tmp_path}:{Path(sys.executable).parent}:{os.environ['PATH']}"

@@ -24,23 +24,6 @@ OPTIONS = [
     "--seed=5",
 ]
 
-SBATCH = """#!/usr/bin/env python3
-import os, re, subprocess, sys
-script = open(sys.argv[-1]).read()
-array = re.search(r"--array=(\\d+)-(\\d+)", script)
-for index in range(int(array[1]), int(array[2]) + 1):
-    environment = {
-        **os.environ, "SLURM_ARRAY_TASK_ID": str(index), "SLURM_NODELIST": "here"
-    }
-    subprocess.run(["bash", sys.argv[-1]], env=environment, stdout=sys.stderr, stderr=sys.stderr)
-print("Submitted batch job 42")
-"""
-
-SRUN = """#!/bin/sh
-shift 3
-exec "$@"
-"""
-
 
 def run(module, output, *options, **environment):
     command = [sys.executable, "-m", module, f"--output_dir={output}", *options]
@@ -87,16 +70,6 @@ def converted(local, tmp_path_factory):
     folder = tmp_path_factory.mktemp("converted") / "out"
     convert(local, folder)
     return folder
-
-
-@pytest.fixture
-def slurm(tmp_path):
-    """A PATH on which scripts stand in for Slurm's commands; they run the arrays that datatrove submits, job scripts
-    and all, here."""
-    for name, text in (("sbatch", SBATCH), ("srun", SRUN), ("scontrol", "#!/bin/sh\necho here\n")):
-        (tmp_path / name).write_text(text)
-        (tmp_path / name).chmod(0o755)
-    return f"{tmp_path}:{Path(sys.executable).parent}:{os.environ['PATH']}"
 
 
 def test_slurm_jobs_record_the_same(local, slurm, tmp_path):
@@ -221,14 +194,15 @@ def test_slurm_runs_work_again_whose_results_were_deleted_and_whose_submission_f
         )
 
     refuse = 'if "--job-name=lansar-finish" in script:\n    sys.exit("too many jobs")\narray ='
-    (tmp_path / "sbatch").write_text(SBATCH.replace("array =", refuse, 1))
+    sbatch = (tmp_path / "sbatch").read_text()
+    (tmp_path / "sbatch").write_text(sbatch.replace("array =", refuse, 1))
     (tmp_path / "scancel").write_text(f"#!/bin/sh\necho $@ > {tmp_path}/cancelled\n")
     (tmp_path / "scancel").chmod(0o755)
     with pytest.raises(subprocess.CalledProcessError):
         submit()
     assert set((tmp_path / "cancelled").read_text().split()) == {"42"}, "jobs without a finish run for nothing"
     assert not list(finished.iterdir())
-    (tmp_path / "sbatch").write_text(SBATCH)
+    (tmp_path / "sbatch").write_text(sbatch)
     for _ in range(2):
         shutil.rmtree(done)
         assert not submit()

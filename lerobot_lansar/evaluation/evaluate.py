@@ -24,7 +24,7 @@ from ..calvin import CHAIN_LENGTH
 from ..command import CommandError, run_command
 from ..envs.episodes import read_episodes
 from ..jobs.executors import run_shards
-from ..jobs.staging import write_atomically
+from ..jobs.staging import end_submitted, refuse_submitted, submitted_jobs, write_atomically
 from .options import EvaluateConfig
 from .stream import Episode
 from .worker import evaluate_shard, finished, line_task
@@ -32,7 +32,8 @@ from .worker import evaluate_shard, finished, line_task
 CONFIG_FILE = "eval_config.json"
 """File in OUTPUT_DIR: which evaluation its lines belong to, for `lansar-report` and for the next run."""
 
-_LOCK = ".lansar-eval.lock"
+_STATE = ".lansar-eval"
+"""Hidden folder in OUTPUT_DIR: the lock, the mark of submitted jobs, their logs."""
 _MAY_CHANGE = ("output_dir", "job_name", "workers", "executor", "slurm", "chains", "videos", "eval")
 """Options that decide no episode's result."""
 
@@ -53,9 +54,11 @@ def evaluate(config: EvaluateConfig) -> Path:
     """
     config.check()
     folder = config.folder
-    folder.mkdir(parents=True, exist_ok=True)
+    state = folder / _STATE
+    state.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder / _LOCK, timeout=3):
+        with FileLock(state / "lock", timeout=3):
+            refuse_submitted(state, folder)
             return _evaluate(config)
     except Timeout:
         raise CommandError(f"another process is evaluating into {folder}: wait for it or stop it") from None
@@ -73,20 +76,22 @@ def _evaluate(config: EvaluateConfig) -> Path:
     missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
     started = time.time()
     config.workers = min(config.workers or 1, max(1, len(missing)))
-    complete = run_shards(
-        (evaluate_shard, (config, env_options, missing)),
-        config.workers if missing else 0,
-        (write_eval_info, (config, started)),
-        executor=config.executor if missing else "local",
-        workers=config.workers,
-        slurm=config.slurm,
-        logging_dir=folder / "logs",
-        progress=lambda: len(_counted(config)),
-        total=len(episodes),
-        unit="chain" if list(desk.suites()) == [LH_MTLC] else "episode",
-        desc="evaluating",
-        status=lambda: _mean(_counted(config), desk.suites()),
-    )
+    executor = config.executor if missing else "local"
+    with submitted_jobs(folder / _STATE, submitting=executor == "slurm"):
+        complete = run_shards(
+            (evaluate_shard, (config, env_options, missing)),
+            config.workers if missing else 0,
+            (write_eval_info, (config, started)),
+            executor=executor,
+            workers=config.workers,
+            slurm=config.slurm,
+            logging_dir=folder / _STATE / "jobs",
+            progress=lambda: len(_counted(config)),
+            total=len(episodes),
+            unit="chain" if list(desk.suites()) == [LH_MTLC] else "episode",
+            desc="evaluating",
+            status=lambda: _mean(_counted(config), desk.suites()),
+        )
     if not complete:
         print(f"submitted; {folder / 'eval_info.json'} appears when the jobs are done")
     return folder
@@ -198,6 +203,7 @@ def write_eval_info(config: EvaluateConfig, started: float, _: int = 0) -> None:
     overall |= {"eval_s": seconds, "eval_ep_s": seconds / overall["n_episodes"]}
     info = {"per_task": per_task, "per_group": groups, "overall": overall}
     write_atomically(config.folder / "eval_info.json", json.dumps(info, indent=2) + "\n")
+    end_submitted(config.folder / _STATE)
 
 
 def _is_success(line: dict[str, Any]) -> bool:

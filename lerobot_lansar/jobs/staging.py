@@ -47,12 +47,10 @@ def staging(
     try:
         with FileLock(folder / _LOCK, timeout=_PATIENCE):
             _claim(folder, target, json.loads(json.dumps(request)), has_results)
-            if submitting:
-                (folder / _SUBMITTED).touch()
             try:
-                yield
+                with submitted_jobs(folder, submitting):
+                    yield
             except BaseException:
-                (folder / _SUBMITTED).unlink(missing_ok=True)
                 if not has_results(folder):
                     shutil.rmtree(folder, ignore_errors=True)
                 raise
@@ -62,9 +60,31 @@ def staging(
 
 def publish(folder: Path, result: Path, target: Path) -> None:
     """Renames `result`, the finished part of a staging folder, to its place and removes the rest."""
-    (folder / _SUBMITTED).unlink(missing_ok=True)  # first: if killed below, no later run waits for jobs
+    end_submitted(folder)  # first: if killed below, no later run waits for jobs
     result.rename(target)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def submitted_jobs(folder: Path, submitting: bool) -> Iterator[None]:
+    """Marks a folder as one that jobs will write into after the block; not if the block raises.
+
+    Args:
+        folder: Exists.
+        submitting: Whether the block submits jobs.
+    """
+    if submitting:
+        (folder / _SUBMITTED).touch()
+    try:
+        yield
+    except BaseException:
+        end_submitted(folder)
+        raise
+
+
+def end_submitted(folder: Path) -> None:
+    """Removes the mark: the jobs are done."""
+    (folder / _SUBMITTED).unlink(missing_ok=True)
 
 
 def refuse_submitted(folder: Path, target: Path) -> None:

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from conftest import STEPS, random_policy
+from random_policies import STEPS, random_policy
 
 from lerobot_lansar.evaluation.rows import ResetAtCommands
 from lerobot_lansar.evaluation.stream import Episode
