@@ -10,13 +10,8 @@ ends of recordings), for an early report; the others are compared while they are
 """
 
 import hashlib
-import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +20,7 @@ from tqdm import tqdm
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.frames import RGB, STATES, frame_file, frame_numbers, read_frame
 from dataset_convert.look import read_look
-from lerobot_lansar.jobs.work import WorkerDied
+from lerobot_lansar.jobs.pool import in_processes
 
 _CHUNK = 2000
 """Frames that a process reads at a time."""
@@ -107,27 +102,11 @@ def _read_keys(folder: Path, frames: np.ndarray, workers: int, desc: str) -> tup
     work = partial(_keys_of_chunk, folder)
     keys: list[int | None] = []
     with tqdm(total=len(frames), desc=f"comparing {desc}", unit="frame", leave=False, disable=len(chunks) == 1) as bar:
-        for chunk in _each(work, chunks, min(workers, len(chunks))):
+        for chunk in in_processes(work, chunks, min(workers, len(chunks)), ordered=True):
             keys += chunk
             bar.update(len(chunk))
     readable = np.array([key is not None for key in keys], dtype=bool)
     return np.array([key or 0 for key in keys], dtype=np.uint64), readable
-
-
-def _each(
-    work: Callable[[np.ndarray], list[int | None]], chunks: list[np.ndarray], workers: int
-) -> Iterator[list[int | None]]:
-    if workers == 1:
-        yield from map(work, chunks)
-        return
-    ignore_interrupts = (signal.SIGINT, signal.SIG_IGN)  # the parent alone reacts to Ctrl-C
-    try:
-        with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, ignore_interrupts) as pool:
-            yield from pool.map(work, chunks)
-    except BrokenProcessPool:
-        raise WorkerDied(
-            "a process that compared frames was killed (out of memory?); run the same command again"
-        ) from None
 
 
 def _keys_of_chunk(folder: Path, frames: np.ndarray) -> list[int | None]:

@@ -1,9 +1,7 @@
 """`lansar-verify`: compares a converted dataset with its source, frame by frame."""
 
 import json
-import multiprocessing
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,6 +18,7 @@ from dataset_convert.verify_cameras import check_cameras
 from dataset_convert.verify_claims import Dataset, Mismatch, check_claims
 from dataset_convert.verify_frames import Found, verify_file
 from lerobot_lansar.command import run_command
+from lerobot_lansar.jobs.pool import in_processes
 
 
 @dataclass
@@ -77,32 +76,12 @@ def _verify_frames(dataset: Dataset, config: VerifyConfig) -> Found:
     work = partial(verify_file, dataset, min_psnr=config.min_psnr)
     whole, total = Found(), dataset.info["total_frames"]
     with tqdm(total=total, desc="verifying", unit="frame") as bar:
-        for found in _each(work, files, config.workers):
+        for found in in_processes(work, files, config.workers):
             bar.update(found.frames)
             whole.add(found)
     if whole.frames != total:
         raise Mismatch(f"{dataset.folder}/data holds {whole.frames} frames, meta/info.json says {total}")
     return whole
-
-
-def _each(work: Callable[[Path], Found], files: list[Path], workers: int) -> Iterator[Found]:
-    if workers == 1:
-        yield from map(work, files)
-        return
-    with multiprocessing.get_context("spawn").Pool(workers, _keep, (work,)) as pool:
-        yield from pool.imap_unordered(_call, files)
-
-
-_kept: list[Callable[[Path], Found]] = []
-
-
-def _keep(work: Callable[[Path], Found]) -> None:
-    """Gives a process its work once: what it knows of the dataset is megabytes, too much to send with every file."""
-    _kept.append(work)
-
-
-def _call(file: Path) -> Found:
-    return _kept[0](file)
 
 
 def _check_stats(dataset: Dataset, found: Found) -> None:

@@ -5,22 +5,17 @@ for its own output; datatrove's completion markers can outlive it.
 """
 
 import importlib.util
-import multiprocessing
-import os
 import shutil
-import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing.context import SpawnContext, SpawnProcess
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
-from .work import SlurmConfig, Work, WorkerDied
+from .pool import in_processes
+from .work import SlurmConfig, Work
 
 EXECUTORS = ("local", "slurm", "ray")
 
@@ -82,79 +77,12 @@ def run_shards(
         if executor == "ray":
             cluster.run_on_ray(work, shards, workers, logging_dir)
         else:
-            _run_here(work, shards, workers)
+            function, arguments = work
+            for _ in in_processes(partial(function, *arguments), range(shards), workers):
+                pass
     function, arguments = finish
     function(*arguments, 0)
     return True
-
-
-def _run_here(work: Work, shards: int, workers: int) -> None:
-    """Runs all shards in processes of this machine; with one worker, in this process."""
-    function, arguments = work
-    if workers == 1:
-        for shard in range(shards):
-            function(*arguments, shard)
-        return
-    context = _Context()
-    pool = ProcessPoolExecutor(workers, context, initializer=_follow_parent)
-    try:
-        with _blocked_interrupts():  # the workers start here
-            futures = [pool.submit(function, *arguments, shard) for shard in range(shards)]
-        wait(futures, return_when=FIRST_EXCEPTION)
-        for future in futures:
-            if future.done():
-                future.result()
-    except BaseException as error:  # end the other workers too, whatever they are doing
-        for process in context.processes:
-            if process.is_alive():
-                process.terminate()
-        if isinstance(error, BrokenProcessPool):
-            raise WorkerDied(
-                "a worker process was killed (out of memory?); run the same command again to go on"
-            ) from None
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-class _Context(SpawnContext):
-    """Starts processes by "spawn" and remembers them: a pool cannot end its own before Python 3.14.
-
-    Attributes:
-        processes: All that were made, in order.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.processes: list[SpawnProcess] = []
-
-    def Process(self, *args: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
-        """Called by the pool."""
-        process = SpawnProcess(*args, **options)
-        self.processes.append(process)
-        return process
-
-
-@contextmanager
-def _blocked_interrupts() -> Iterator[None]:
-    """Holds Ctrl-C back. Processes that start in the block ignore it for good, so that their parent alone reacts."""
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-def _follow_parent() -> None:
-    """Makes a worker exit when the main process was killed."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
 
 
 @contextmanager
