@@ -42,18 +42,28 @@ def refuse_recording(mixed: bool, depth: bool) -> None:
         raise CommandError("--eval.recording=true cannot store depth: leave out --env.depth, or use lansar-record")
 
 
-def check_environment_state(task_in_state: bool) -> None:
-    """Compares the environment's `environment_state` with what the command's policy was trained on.
+def check_policy(task_in_state: bool, pictures: Pictures) -> None:
+    """Compares the environment's observations with what the command's policy was trained on.
 
-    A policy that gets another number of inputs would end with "mat1 and mat2 shapes cannot be multiplied".
+    A policy that gets another number of inputs would end with "mat1 and mat2 shapes cannot be multiplied", one that
+    reads depth would end with a KeyError without; one that gets pictures of another size does not end, but fails at its
+    tasks.
 
     Args:
         task_in_state: The environment's option.
+        pictures: Its pictures.
 
     Raises:
-        CommandError: They differ by the task's 34 numbers.
+        CommandError: `environment_state` differs by the task's 34 numbers; pictures have another size; the policy reads
+            depth and there is none.
     """
-    size, trained = environment_state_size(task_in_state), _trained_shapes().get(OBS_ENV_STATE, (None,))[0]
+    shapes = _trained_shapes()
+    _check_environment_state(task_in_state, shapes)
+    _check_pictures(pictures, shapes)
+
+
+def _check_environment_state(task_in_state: bool, shapes: dict[str, tuple[int, ...]]) -> None:
+    size, trained = environment_state_size(task_in_state), shapes.get(OBS_ENV_STATE, (None,))[0]
     if trained == environment_state_size(not task_in_state):
         raise CommandError(
             f"the policy was trained on {trained} numbers of {OBS_ENV_STATE}, but the environment gives {size}: "
@@ -61,16 +71,7 @@ def check_environment_state(task_in_state: bool) -> None:
         )
 
 
-def check_pictures(pictures: Pictures) -> None:
-    """Compares the environment's pictures with those that the command's policy was trained on.
-
-    A policy that reads depth would end with a KeyError without; one that gets pictures of another size does not end,
-    but fails at its tasks.
-
-    Raises:
-        CommandError: They have another size, or the policy reads depth and there is none.
-    """
-    trained = _trained_shapes()
+def _check_pictures(pictures: Pictures, trained: dict[str, tuple[int, ...]]) -> None:
     for camera in pictures.cameras:
         key, size = f"{OBS_IMAGES}.{camera}", pictures.size(camera)
         if f"{key}_depth" in trained and not pictures.depth:

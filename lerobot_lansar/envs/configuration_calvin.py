@@ -18,8 +18,7 @@ from ..desk.render import OURS
 from ..pictures import check_size
 from .calvin import LARGEST_RENDER, CalvinEnv
 from .command_line import (
-    check_environment_state,
-    check_pictures,
+    check_policy,
     evaluated_policy,
     refuse_recording,
     trained_depth_unit,
@@ -172,8 +171,7 @@ class CalvinEnvConfig(EnvConfig):
                 would mix up or cannot store.
         """
         refuse_recording(mixed=self.sentence == "random" or LH_MTLC in self.suites(), depth=self.depth)
-        check_environment_state(self.task_in_state)
-        check_pictures(self._pictures())
+        check_policy(self.task_in_state, self._pictures())
         return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[])
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:

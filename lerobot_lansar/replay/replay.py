@@ -86,6 +86,10 @@ class ReplayConfig:
 
     def numbers(self, source: Source) -> list[int]:
         """Which of the source's recordings to replay."""
+        if len(source) == 0:
+            raise CommandError(
+                f"there are no {source.unit}s to replay in {self.dataset_dir or self.root or self.repo_id}"
+            )
         if self.episodes is not None:
             count = min(self.episodes, len(source))
             return sorted(np.random.default_rng(self.seed).choice(len(source), count, replace=False).tolist())
