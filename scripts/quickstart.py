@@ -124,10 +124,9 @@ def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None
     """Evaluates every task from unseen starts and writes the report; returns the evaluation's folder."""
     folder = OUT / f"eval_{name}"
     if not (folder / "eval_info.json").exists():
-        shutil.rmtree(folder, ignore_errors=True)
         run(
             f"evaluate ({name})",
-            "lerobot-eval",
+            "lansar-eval",
             f"--policy.path={checkpoint}",
             "--env.type=calvin",
             f"--env.task={','.join(TASKS)}",
@@ -135,15 +134,13 @@ def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None
             "--env.cameras=[]",
             f"--env.annotations={SENTENCES}",
             "--env.render_fps=6",
-            f"--env.results_dir={folder}",
             f"--eval.n_episodes={EPISODES_PER_TASK}",
-            "--eval.batch_size=10",
             f"--seed={EVALUATION_SEED}",
             f"--output_dir={folder}",
             *options,
             log=log,
         )
-    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
+    run(f"report ({name})", "lansar-report", f"--eval_dir={folder}", log=log)
     return folder
 
 
@@ -151,8 +148,7 @@ def untrained() -> Path:
     """Evaluates the same network with random weights: one update with learning rate 0 makes the checkpoint."""
     log = OUT / "untrained.log"
     checkpoint = train("untrained", "--steps=1", "--policy.learning_rate=0", log=log)
-    one_core = "--eval.use_async_envs=false"  # training uses the other one
-    return evaluate("untrained", checkpoint, one_core, log=log)
+    return evaluate("untrained", checkpoint, "--workers=1", log=log)  # training uses the other core
 
 
 def success(folder: Path) -> dict[str, dict[str, float]]:
@@ -197,7 +193,7 @@ def main() -> None:
         summary["minutes"] = max(summary["minutes"], json.loads(file.read_text())["minutes"])
     file.write_text(json.dumps(summary, indent=2) + "\n")
     print(f"\n{json.dumps(summary, indent=2)}\n\nsummary: {file}")
-    print(f"report and plots: {trained}/report.md   rollout videos: {trained}/videos/")
+    print(f"report with plots and videos, to open in a browser: {trained}/report.html")
     print("Built-in desk, state and language policy: these are not CALVIN benchmark numbers.")
 
 

@@ -12,7 +12,7 @@ README = Path(__file__).resolve().parents[1] / "README.md"
 
 SIZES = {
     "--episodes=3400 --workers=2": "--episodes=2 --tasks=[open_drawer,turn_on_led]",
-    "--eval.n_episodes=1000 --eval.batch_size=10": "--eval.n_episodes=1 --eval.batch_size=1",
+    "--chains=1000": "--chains=2",
     "--eval.n_episodes=50": "--eval.n_episodes=1 --eval.batch_size=1",
     "eval.n_episodes=10 ": "eval.n_episodes=1 eval.batch_size=1 ",
 }
@@ -23,6 +23,7 @@ ADDED = {
     "lerobot-train --config_path": "--steps=2 --policy.clip.model=lansar-tiny --policy.clip.pretrained=",
     "lerobot-train --policy.type=act": "--steps=2 --batch_size=2 --num_workers=0 --policy.dim_model=32 "
     "--policy.n_heads=2 --policy.dim_feedforward=64 --policy.pretrained_backbone_weights=null",
+    "lansar-eval": "--env.steps_per_command=5 --env.render_fps=2 --workers=1",
     "lerobot-eval": "--env.steps_per_command=5 --env.render_fps=2",
     "lerobot eval": "env.steps_per_command=5 env.render_fps=2",
     "lansar-replay": "--output_dir=outputs/replay",
@@ -72,6 +73,7 @@ def test_every_command_of_the_readme_runs_in_its_order_outside_the_checkout(tmp_
     for result in ("chains", "tasks", "act"):
         assert (tmp_path / "outputs/eval" / result / "episodes.jsonl").is_file()
     assert "average length" in (tmp_path / "outputs/eval/chains/report.md").read_text()
+    assert "ACT" in (tmp_path / "outputs/report/report.html").read_text()
     assert list((tmp_path / "outputs/replay").glob("*.mp4"))
     assert (tmp_path / "outputs/attention/context_attention.png").is_file()
 
