@@ -47,7 +47,7 @@ def _model_config(model: str) -> dict[str, Any]:
     config = _open_clip().get_model_config(model)
     if config is None:
         raise ValueError(
-            f"--policy.clip.model={model!r} is not known to open_clip. Examples: ViT-B-32, ViT-L-14, "
+            f"clip.model={model!r} is not known to open_clip. Examples: ViT-B-32, ViT-L-14, "
             'lansar-tiny; all names: python -c "import open_clip; print(open_clip.list_models())"'
         )
     return config
@@ -92,7 +92,7 @@ class Clip:
         if weights is None and config.pretrained and not tag and not Path(config.pretrained).is_file():
             tags = ", ".join(open_clip.list_pretrained_tags_by_model(config.model)) or "it has none"
             raise ValueError(
-                f"--policy.clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of "
+                f"clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of "
                 f"{config.model} ({tags})."
             )
         # open_clip warns about random weights; here that is intended, or a checkpoint follows.
