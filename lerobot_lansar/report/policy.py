@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..command import CommandError
+from .published import GRIPPER, ROBOT, SCENE, STATIC
 
 MANIFEST = "meta/calvin_source.json"
 """The file in which `lansar-convert` says where a dataset's pictures come from."""
@@ -33,7 +34,10 @@ class Policy:
                 f"the hub returns: {error}"
             ) from error
         self._path = path
-        self._config = json.loads(file.read_text())
+        try:
+            self._config = json.loads(file.read_text())
+        except ValueError as error:
+            raise CommandError(f"{file} is not JSON: {error}") from error
         self._inputs = self._config.get("input_features") or {}
 
     @property
@@ -41,6 +45,24 @@ class Policy:
         """Whether it reads the simulator's own state."""
         # LanSAR may ignore the scene state although its inputs include it.
         return self._config.get("use_spatial_context", True) and "observation.environment_state" in self._inputs
+
+    @property
+    def reads(self) -> list[str]:
+        """Its inputs beside language, in the words of `published`."""
+        pictures = [key for key in self._inputs if key.startswith("observation.image")]
+        if self._config.get("use_images"):  # LanSAR sees both cameras, through embeddings that are not among its inputs
+            found = [STATIC, GRIPPER]
+        else:
+            cameras = {STATIC: "static", GRIPPER: "gripper"}
+            found = [words for words, camera in cameras.items() if any(camera in key for key in pictures)]
+            found = found or (["pictures"] if pictures else [])
+        state = [ROBOT] if "observation.state" in self._inputs else []
+        return [*found, *state, *([SCENE] if self.reads_scene_state else [])]
+
+    @property
+    def action_steps(self) -> int:
+        """How many actions it carries out before it looks again."""
+        return int(self._config.get("n_action_steps") or 1)
 
     def trained_look(self) -> dict[str, Any] | None:
         """What is known of `LOOK` for the pictures that it was trained on; None if it reads none or nothing is known.
@@ -63,7 +85,7 @@ def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None
 
     Args:
         trained: What `Policy.trained_look` returned.
-        settings: The evaluation's, as `summarise` returns them. What either lacks is not compared.
+        settings: The evaluation's. What either lacks is not compared.
     """
     found = []
     for key, wanted in trained.items():
