@@ -94,7 +94,7 @@ IN_A_ROW_HEADER = [
     "in a row, % of chains",
     *map(str, range(1, CHAIN_LENGTH + 1)),
     "average length",
-    "commands, %",
+    "local success, %",
     "reads",
 ]
 
@@ -110,7 +110,7 @@ def difference_rows(table: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-DIFFERENCE_HEADER = ["difference, points", *map(str, range(1, CHAIN_LENGTH + 1)), "average length", "chains of both"]
+DIFFERENCE_HEADER = ["difference, points", *map(str, range(1, CHAIN_LENGTH + 1)), "average length", "chains compared"]
 
 
 def task_rows(table: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -131,6 +131,9 @@ def _task_cell(counts: dict[str, Any] | None) -> str:
 
 
 def distinct(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Every evaluation once, although several tables may show it."""
-    rows = [row for table in report["tables"] for row in table["evaluations"]]
-    return list({tuple(row["folders"]): row for row in reversed(rows)}.values())[::-1]
+    """Every evaluation once, under its first label, although several tables may show it."""
+    found: dict[tuple[str, ...], dict[str, Any]] = {}
+    for table in report["tables"]:
+        for row in table["evaluations"]:
+            found.setdefault(tuple(row["folders"]), row)
+    return list(found.values())

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..benchmark import LH_MTLC
+from ..calvin import TASK_GROUPS
 from ..command import CommandError
+from .figures import share
 
 SOURCE = "lerobot_policy_lansar"
 """Name of the source in every entry of ours; by it a later push finds them."""
@@ -55,16 +57,19 @@ def _metrics(row: dict[str, Any]) -> list[tuple[str, str, float, dict[str, Any] 
     if "in_a_row" in row:
         interval = row["average_length_interval"]
         found.append(("average_length", "Average length (of 5)", round(row["average_length"], 4), _interval(interval)))
-        for k, (share, interval) in enumerate(zip(row["in_a_row"], row["in_a_row_intervals"], strict=True), start=1):
+        for k, (reached, interval) in enumerate(zip(row["in_a_row"], row["in_a_row_intervals"], strict=True), start=1):
             text = f"At least {k} in a row (%)"
-            found.append(("success_rate", text, round(100 * share, 2), _interval(interval, 100)))
+            found.append(("success_rate", text, round(100 * reached, 2), _interval(interval, 100)))
     local = row["local_success_rate_interval"]
     text = "Success per attempted command (%)"
     found.append(("success_rate", text, round(100 * row["local_success_rate"], 2), _interval(local, 100)))
     if row["kind"] == "single tasks" and len(row["tasks"]) > 1:
-        for task, counts in row["tasks"].items():
-            interval = _interval(counts["interval"], 100)
-            found.append(("success_rate", f"{task} (%)", round(100 * counts["rate"], 2), interval))
+        for group, tasks in TASK_GROUPS.items():
+            counts = [row["tasks"][task] for task in tasks if task in row["tasks"]]
+            if counts:
+                one = share(sum(c["successes"] for c in counts), sum(c["attempts"] for c in counts))
+                text = f"{group}: {', '.join(task for task in tasks if task in row['tasks'])} (%)"
+                found.append(("success_rate", text, round(100 * one["rate"], 2), _interval(one["interval"], 100)))
     return found
 
 
@@ -99,8 +104,14 @@ def push(repo_id: str, row: dict[str, Any]) -> None:
     Raises:
         CommandError: There is no such model, it may not be written to, or its card is malformed.
     """
+    from httpx import HTTPError
     from huggingface_hub import HfApi, metadata_load, metadata_save
-    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, HFValidationError
+    from huggingface_hub.errors import (
+        EntryNotFoundError,
+        HfHubHTTPError,
+        HFValidationError,
+        LocalEntryNotFoundError,
+    )
 
     api = HfApi()
     with tempfile.TemporaryDirectory() as folder:
@@ -109,6 +120,8 @@ def push(repo_id: str, row: dict[str, Any]) -> None:
             try:
                 card.write_bytes(Path(api.hf_hub_download(repo_id, "README.md")).read_bytes())
                 metadata = metadata_load(card) or {}
+            except LocalEntryNotFoundError:  # the hub did not answer
+                raise
             except EntryNotFoundError:
                 card.write_text(f"# {repo_id.rpartition('/')[2]}\n")
                 metadata = {}
@@ -116,12 +129,12 @@ def push(repo_id: str, row: dict[str, Any]) -> None:
             metadata_save(card, {**metadata, "model-index": merged})
             message = "Evaluation on the CALVIN desk"
             api.upload_file(path_or_fileobj=card, path_in_repo="README.md", repo_id=repo_id, commit_message=message)
-        except (HfHubHTTPError, HFValidationError, OSError) as error:
+        except (HfHubHTTPError, HFValidationError, HTTPError, OSError) as error:
             raise CommandError(
-                f"--push_to_hub={repo_id}: cannot write the card of that model: {error}. It must exist, and you must be "
-                "logged in (hf auth login) with a token that may write to it"
+                f"--push_to_hub={repo_id}: cannot write the card of that model: {error}. It must exist, and you must "
+                "be logged in (hf auth login) with a token that may write to it"
             ) from error
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CommandError(f"--push_to_hub={repo_id}: the header of its README.md is malformed: {error}") from error
 
 

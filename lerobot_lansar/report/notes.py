@@ -83,10 +83,11 @@ def _episodes(row: dict[str, Any], chains_known: bool) -> list[str]:
     several = [key for key, value in row["settings"].items() if isinstance(value, list)]
     if several:
         notes.append(f"Its episodes were not all run alike: see {', '.join(several)}.")
-    if row["ended_early"]:
+    early = row["ended_early"]
+    if early:
         notes.append(
-            f"{row['ended_early']} episodes failed because the desk refused an action or the simulation diverged: "
-            f"see `reason` in {EPISODES_FILE}."
+            f"{early} episode{'s' if early > 1 else ''} failed because the desk refused an action or the simulation "
+            f"diverged: see `reason` in {EPISODES_FILE}."
         )
     if row["kind"] == "single tasks":
         return notes
@@ -115,7 +116,7 @@ def grouped(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
     for row in rows:
         for note in row["notes"]:
             found.setdefault(note, []).append(row["label"])
-    return [(", ".join(labels), note) for note, labels in found.items()]
+    return [("; ".join(labels), note) for note, labels in found.items()]
 
 
 def of_table(rows: list[dict[str, Any]], published: bool) -> list[str]:
@@ -129,13 +130,13 @@ def of_table(rows: list[dict[str, Any]], published: bool) -> list[str]:
     foreign = [row["label"] for row in rows if row["settings"]["assets"] != "original"]
     if published and foreign:
         notes.append(
-            f"Not comparable: published rows were measured on CALVIN's original assets, {', '.join(foreign)} on the "
-            "built-in desk or an unknown one."
+            "Not comparable: published rows were measured on CALVIN's original assets, but "
+            f"{'; '.join(foreign)} on the built-in desk or an unknown one."
         )
     privileged = [row["label"] for row in rows if row["policy_reads_scene_state"]]
     if privileged and (published or len(rows) > 1):
         verb = "read" if len(privileged) > 1 else "reads"
-        notes.append(f"Privileged: {', '.join(privileged)} {verb} the simulator's own scene state.")
+        notes.append(f"Privileged: {'; '.join(privileged)} {verb} the simulator's own scene state.")
     differing = [
         f"{key.replace('_', ' ')} ({', '.join(str(row['settings'][key]) for row in rows)})"
         for key in rows[0]["settings"]

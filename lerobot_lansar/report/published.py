@@ -112,9 +112,9 @@ PUBLISHED: dict[str, Source] = {
         "LanSAR thesis, Table 5.4",
         (
             Published("not perturbed", _BEST, _LANSAR),
-            Published("scale 5, every 50", _shares(70.3, 45.8, 27.8, 16.0, 7.9), _LANSAR),
-            Published("scale 2.5, every 25", _shares(71.0, 46.7, 28.0, 16.2, 9.5), _LANSAR),
-            Published("scale 0.5, every 5", _shares(70.5, 47.8, 29.5, 17.6, 7.8), _LANSAR),
+            Published("5 every 50", _shares(70.3, 45.8, 27.8, 16.0, 7.9), _LANSAR),
+            Published("2.5 every 25", _shares(71.0, 46.7, 28.0, 16.2, 9.5), _LANSAR),
+            Published("0.5 every 5", _shares(70.5, 47.8, 29.5, 17.6, 7.8), _LANSAR),
         ),
         spread=True,
     ),
