@@ -135,7 +135,7 @@ def _svg(figure: Figure, description: str) -> str:
     text = file.getvalue()
     text = text[text.index("<svg") :].strip()
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    text = re.sub(r'<g id="\w+">', "<g>", text)  # figure_1, axes_1 …: the same in every plot
+    text = re.sub(r'<g id="[^"]*">', "<g>", text)  # figure_1, axes_1 …: the same in every plot
     text = re.sub(r'\s*xmlns:xlink="[^"]*"', "", text).replace("xlink:href", "href")
     text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
     text = text.replace(_INK, "currentColor").replace(_RULE, "var(--rule)")
