@@ -6,8 +6,8 @@ from typing import Any
 from ..calvin import CHAIN_LENGTH
 
 INTERVALS = (
-    "In brackets: 95 % intervals. Shares have Wilson's, averages and differences a percentile bootstrap over chains. "
-    "They tell what the choice of chains leaves open, not what another training would change."
+    "In brackets: 95 % intervals. Shares have Wilson's, which takes attempts as independent; averages and differences "
+    "have a percentile bootstrap over chains. They tell what the choice of chains leaves open, not what another training would change."
 )
 
 
@@ -20,8 +20,13 @@ def bracket(interval: Sequence[float] | None, scale: float = 1, digits: int = 2,
     """An interval in brackets; empty if there is none."""
     if interval is None:
         return ""
-    low, high = (format(scale * end, f"{sign}.{digits}f") for end in interval)
+    low, high = (number(scale * end, digits, sign) for end in interval)
     return f" [{low}, {high}]"
+
+
+def number(value: float, digits: int, sign: str = "+") -> str:
+    """A number with a minus sign, not a hyphen; also with a plus sign unless `sign` is empty."""
+    return format(value, f"{sign}.{digits}f").replace("-", "−")
 
 
 def share_text(share: float, interval: Sequence[float] | None) -> str:
@@ -104,8 +109,8 @@ def difference_rows(table: dict[str, Any]) -> list[list[str]]:
     rows = []
     for one in table["differences"]:
         pairs = zip(one["in_a_row"], one["in_a_row_intervals"], strict=True)
-        shares = [f"{100 * share:+.1f}" + bracket(interval, 100, 1, "+") for share, interval in pairs]
-        length = f"{one['average_length']:+.3f}" + bracket(one["average_length_interval"], 1, 2, "+")
+        shares = [number(100 * share, 1) + bracket(interval, 100, 1, "+") for share, interval in pairs]
+        length = number(one["average_length"], 3) + bracket(one["average_length_interval"], 1, 2, "+")
         rows.append([f"{one['evaluation']} − {one['baseline']}", *shares, length, str(one["chains"])])
     return rows
 

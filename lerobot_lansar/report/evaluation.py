@@ -30,6 +30,7 @@ class Part:
         episodes: The finished episodes that count.
         expected: Keys of all episodes that were asked for; None if unknown.
         policy: `--policy.path` of the evaluation; None if unknown.
+        named: The policy that its own files name, even if the user named another.
         facts: command, hardware and seconds of `eval_config.json`, where known.
         chains_known: Whether the files or `--seed` say which chains these are.
         videos: Key of an episode to its video, where one exists.
@@ -39,6 +40,7 @@ class Part:
     episodes: list[Episode]
     expected: set[tuple[str, int]] | None
     policy: str | None
+    named: str | None
     facts: dict[str, Any]
     chains_known: bool
     videos: dict[tuple[str, int], Path]
@@ -116,11 +118,13 @@ def read_part(folder: Path, seed: int | None = None, policy: str | None = None) 
             raise ValueError(f"{folder}: {EPISODES_FILE} holds none of the episodes that {PLAN_FILE} asks for")
     if expected is None and entries:
         expected = {episode.key for episode in episodes}
+    named = _policy(folder, episodes, plan)
     return Part(
         folder,
         episodes,
         expected,
-        policy or _policy(folder, episodes, plan),
+        policy or named,
+        named,
         {key: value for key, value in plan.facts.items() if key != "policy" and value is not None},
         chains_known=plan.seed is not None or bool(lines),
         videos=_videos(folder, episodes, plan, entries),

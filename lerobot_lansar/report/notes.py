@@ -22,7 +22,8 @@ def missing_text(row: dict[str, Any]) -> str:
     Args:
         row: An evaluation of `report.json`.
     """
-    what = "episodes" if row["kind"] != "chains" else "chains"
+    count = row["episodes"] if row["missing"] is None else row["expected"]
+    what = ("chain" if row["kind"] == "chains" else "episode") + "s" * (count != 1)
     if row["missing"] is None:
         return f"{row['episodes']} {what}; how many are missing is unknown, since no file says how many were asked for"
     return f"{row['missing']} of {row['expected']} {what} missing"

@@ -144,7 +144,7 @@ def _cell(
     link = None if video is None else quote(os.path.relpath(video, folder).replace(os.sep, "/"))
     return {
         "verdict": f"{episode.successes} of {commands}",
-        "steps": "" if alone else " ".join(f"{mark} {steps}".strip() for mark, steps in _marks(episode)),
+        "steps": "" if alone else " ".join(f"{mark}\u00a0{steps}".strip() for mark, steps in _marks(episode)),
         "reason": episode.reason,
         "video": link,
     }

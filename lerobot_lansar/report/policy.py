@@ -20,14 +20,16 @@ class Policy:
 
     Args:
         path: `--policy.path` of its evaluation.
+        download: Whether to ask the hub for what is not on this machine.
 
     Raises:
         CommandError: There is no policy.
     """
 
-    def __init__(self, path: str):
+    def __init__(self, path: str, download: bool = True):
+        self._download = download
         try:
-            file = _file(path, "config.json")
+            file = self._file(path, "config.json")
         except (OSError, ValueError) as error:
             raise CommandError(
                 f"--policy_path={path} is neither a pretrained_model folder with a config.json nor a policy that "
@@ -72,12 +74,30 @@ class Policy:
         if not any(key.startswith("observation.image") for key in self._inputs):
             return None
         try:
-            dataset = json.loads(_file(self._path, "train_config.json").read_text())["dataset"]
-            look = json.loads(_manifest(dataset).read_text())["look"]
+            dataset = json.loads(self._file(self._path, "train_config.json").read_text())["dataset"]
+            look = json.loads(self._manifest(dataset).read_text())["look"]
         except (OSError, ValueError, KeyError):
             return None
         known = {key: look[key] for key in LOOK if look.get(key) is not None}
         return {"image_size": 0, **known} if "image_size" in look else known  # 0 or none: the cameras' own
+
+    def _manifest(self, dataset: dict[str, Any]) -> Path:
+        """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
+        cache = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "lerobot"
+        root = dataset.get("root") or Path(os.environ.get("HF_LEROBOT_HOME", cache)) / dataset["repo_id"]
+        file = Path(root).expanduser() / MANIFEST
+        return file if file.is_file() else self._fetch(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
+
+    def _file(self, path: str, name: str) -> Path:
+        """A policy's file: in a folder, or else from the hub."""
+        file = Path(path) / name
+        return file if file.is_file() else self._fetch(path, name)
+
+    def _fetch(self, repo_id: str, name: str, kind: str = "model", revision: str | None = None) -> Path:
+        from huggingface_hub import hf_hub_download  # late: most reports need no hub
+
+        only_here = not self._download
+        return Path(hf_hub_download(repo_id, name, repo_type=kind, revision=revision, local_files_only=only_here))
 
 
 def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None:
@@ -100,23 +120,3 @@ def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None
 def _same_look(value: Any) -> Any:
     """Our renderers and PyBullet's of the same name have one look."""
     return value.removeprefix("pybullet_") if isinstance(value, str) else value
-
-
-def _manifest(dataset: dict[str, Any]) -> Path:
-    """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
-    cache = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "lerobot"
-    root = dataset.get("root") or Path(os.environ.get("HF_LEROBOT_HOME", cache)) / dataset["repo_id"]
-    file = Path(root).expanduser() / MANIFEST
-    return file if file.is_file() else _download(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
-
-
-def _file(path: str, name: str) -> Path:
-    """A policy's file: in a folder, or else downloaded from the hub."""
-    file = Path(path) / name
-    return file if file.is_file() else _download(path, name)
-
-
-def _download(repo_id: str, name: str, kind: str = "model", revision: str | None = None) -> Path:
-    from huggingface_hub import hf_hub_download  # late: most reports need no hub
-
-    return Path(hf_hub_download(repo_id, name, repo_type=kind, revision=revision))

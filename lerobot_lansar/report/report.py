@@ -72,7 +72,14 @@ def _tables(config: ReportConfig, left_out: list[str]) -> tuple[list[dict[str, A
         return [], []
     per_folder = policies if isinstance(policies, list) else [policies] * len(folders)
     pairs = zip(folders, per_folder, strict=True)
-    evaluations = group(read_part(Path(name), config.seed, policy) for name, policy in pairs)
+    parts = [read_part(Path(name), config.seed, policy) for name, policy in pairs]
+    named = sorted({part.named for part in parts if part.named is not None})
+    if isinstance(policies, str) and len(named) > 1:
+        raise CommandError(
+            f"--policy_path names one policy, but the evaluations name {len(named)}: {', '.join(named)}. Give a list "
+            "with one for each folder of --eval_dir, or leave it out"
+        )
+    evaluations = group(parts)
     _name(evaluations, as_list(config.labels))
     described = [(evaluation, describe(evaluation, policies is not None)) for evaluation in evaluations]
     title = described[0][0].label if len(described) == 1 else "Comparison"

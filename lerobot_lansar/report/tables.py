@@ -56,11 +56,11 @@ def describe(evaluation: Evaluation, policy_given: bool = False) -> dict[str, An
 
 
 def _policy(path: str | None, given: bool) -> Policy | None:
-    """The policy, or None if it is unknown or no longer where the evaluation found it."""
+    """The policy, or None if it is unknown or not on this machine; one that the user named may be downloaded."""
     if path is None:
         return None
     try:
-        return Policy(path)
+        return Policy(path, download=given)
     except CommandError:
         if given:
             raise

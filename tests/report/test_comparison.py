@@ -41,7 +41,7 @@ def test_evaluations_stand_side_by_side(tmp_path, two):
     assert paired["in_a_row"] == [0, -0.25, 0, -0.25, -0.25]
     text = (tmp_path / "out/report.md").read_text()
     assert "| ACT − LanSAR" in text
-    assert "-0.750 [-1.50, +0.00]" in text
+    assert "−0.750 [−1.50, +0.00]" in text
     assert table["standard_deviation"] is None
 
 

@@ -6,6 +6,7 @@ import pytest
 from eval_files import chain_line, write_eval, write_lines, write_plan
 
 from lerobot_lansar.benchmark import EPISODES_FILE
+from lerobot_lansar.command import CommandError
 from lerobot_lansar.report.evaluation import group, merge, read_part, set_labels
 from lerobot_lansar.report.report import ReportConfig, report
 
@@ -57,6 +58,12 @@ def test_a_given_policy_merges_parts_that_do_not_know_theirs(tmp_path):
     assert "give --policy_path and they are merged" in content["tables"][0]["notes"][-1]
 
 
+def test_one_given_policy_cannot_stand_for_several(tmp_path):
+    folders = [str(lines(tmp_path / name, [0], policy=name)) for name in "ab"]
+    with pytest.raises(CommandError, match="the evaluations name 2: a, b"):
+        report(ReportConfig(folders, tmp_path / "out", policy_path="moved"))
+
+
 def test_chains_and_single_tasks_are_not_merged(tmp_path):
     a = lines(tmp_path / "a", [0], policy="p")
     b = write_lines(tmp_path / "b", [(1, None, [("open_drawer", True)])], policy="p")
@@ -102,7 +109,7 @@ def test_without_a_plan_only_lerobots_own_results_tell_that_nothing_is_missing(t
     finished = write_eval(lines(tmp_path / "b", [0], 2), ("lh_mtlc", [2.0]))
     assert merge([read_part(finished)]).missing == []
     report(ReportConfig(str(tmp_path / "a")))
-    assert "1 chains; how many are missing is unknown" in (tmp_path / "a/report.md").read_text()
+    assert "1 chain; how many are missing is unknown" in (tmp_path / "a/report.md").read_text()
 
 
 @pytest.mark.parametrize("entry", [{}, {"seed": 0}, {"n_episodes": 3, "suites": {}}])

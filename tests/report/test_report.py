@@ -78,9 +78,9 @@ def test_the_report_is_saved_as_page_json_and_text(tmp_path):
 def test_what_is_missing_is_said_first(tmp_path):
     report(ReportConfig(str(write_eval(tmp_path, ("calvin", [5.0])))))
     lines = (tmp_path / "report.md").read_text().splitlines()
-    assert lines[2].endswith(": 0 of 1 chains missing")
+    assert lines[2].endswith(": 0 of 1 chain missing")
     page = (tmp_path / "report.html").read_text()
-    assert page.index("0 of 1 chains missing") < page.index("Measured on")
+    assert page.index("0 of 1 chain missing") < page.index("Measured on")
 
 
 def test_single_tasks_are_reported_per_task_without_chains(tmp_path):
@@ -199,6 +199,21 @@ def test_the_policy_may_be_one_on_the_hub(tmp_path, monkeypatch):
     for missing in ("you/other", "outputs/train/no/such/folder"):
         with pytest.raises(CommandError, match=f"--policy_path={missing} is neither"):
             row_of(evaluation, policy_path=missing)
+
+
+def test_only_a_policy_that_the_user_names_is_looked_for_on_the_hub(tmp_path, monkeypatch):
+    asked = []
+
+    def ask(repo_id, name, local_files_only, **_):
+        asked.append((repo_id, local_files_only))
+        raise OSError("not here")
+
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", ask)
+    write_lines(tmp_path, [(0, 0, [("open_drawer", False)])], policy="you/policy")
+    row_of(tmp_path)
+    with pytest.raises(CommandError, match="not here"):
+        row_of(tmp_path, policy_path="you/policy")
+    assert asked == [("you/policy", True), ("you/policy", False)]
 
 
 def test_a_policy_that_has_moved_is_unknown_until_its_new_place_is_given(tmp_path):
