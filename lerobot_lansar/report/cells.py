@@ -7,7 +7,8 @@ from ..calvin import CHAIN_LENGTH
 
 INTERVALS = (
     "In brackets: 95 % intervals. Shares have Wilson's, which takes attempts as independent; averages and differences "
-    "have a percentile bootstrap over chains. They tell what the choice of chains leaves open, not what another training would change."
+    "have a percentile bootstrap over chains. They tell what the choice of chains leaves open, not what another "
+    "training would change."
 )
 
 
