@@ -58,7 +58,7 @@ def plot_in_a_row(table: dict[str, Any], salt: str) -> str:
             axes.errorbar(places, shares, yerr=list(zip(*spans, strict=True)), fmt="none", ecolor=_INK, elinewidth=1)
         axes.grid(axis="y", linewidth=0.6)
         axes.set(xlabel="commands in a row", ylabel="chains (%)", ylim=(0, 104), xticks=range(1, CHAIN_LENGTH + 1))
-        _legend(figure, len(rows))
+        _legend(figure)
         return _svg(figure, f"Success of 1 to 5 commands in a row: {', '.join(row['label'] for row in rows)}")
 
 
@@ -84,7 +84,7 @@ def plot_tasks(table: dict[str, Any], salt: str) -> str:
         axes.grid(axis="x", linewidth=0.6)
         axes.set(xlabel="success per attempt (%)", xlim=(0, 114), xticks=range(0, 101, 20))
         axes.margins(y=0.01)
-        _legend(figure, len(rows))
+        _legend(figure)
         return _svg(figure, f"Success of each task: {', '.join(row['label'] for row in rows)}")
 
 
@@ -103,7 +103,7 @@ def plot_losses(trainings: list[dict[str, Any]], salt: str) -> str:
                               label=f"{label}, {name}")  # fmt: skip
         axes.grid(axis="y", linewidth=0.6)
         axes.set(xlabel="updates", ylabel="loss")
-        _legend(figure, 2 * len(trainings))
+        _legend(figure)
         return _svg(figure, f"Losses of {', '.join(training['label'] for training in trainings)}")
 
 
@@ -118,13 +118,17 @@ def _colour(number: int) -> str:
 
 
 def _plain(label: str) -> str:
-    """matplotlib reads $…$ as mathematics, and leaves labels that begin with _ out of legends."""
-    return label.replace("$", r"\$").replace("_", "\u200b_", 1) if label.startswith("_") else label.replace("$", r"\$")
+    """A label for a legend: not too long, without the mathematics of $…$, and never left out, as _… would be."""
+    short = label if len(label) <= 48 else f"{label[:47]}…"
+    return ("\u200b" if short.startswith("_") else "") + short.replace("$", r"\$")
 
 
-def _legend(figure: Figure, entries: int) -> None:
-    if entries > 1:
-        figure.legend(loc="outside upper left", ncols=min(entries, 2), fontsize=9, handlelength=1.2)
+def _legend(figure: Figure) -> None:
+    """A legend above the plot, in two columns if the names are short enough for that."""
+    names = figure.axes[0].get_legend_handles_labels()[1]
+    if len(names) > 1:
+        columns = 2 if max(map(len, names)) <= 28 else 1
+        figure.legend(loc="outside upper left", ncols=columns, fontsize=9, handlelength=1.2)
 
 
 def _svg(figure: Figure, description: str) -> str:
