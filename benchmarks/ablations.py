@@ -178,7 +178,7 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
             log=log,
         )
         command("lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
-    report = json.loads((folder / "report.json").read_text())
+    (report,) = json.loads((folder / "report.json").read_text())["tables"][0]["evaluations"]
     figures = {name: report[name] for name in ("average_length", "in_a_row", "local_success_rate", "tasks")}
     return {"variant": variant, "seed": seed, "train_minutes": minutes, **figures}
 

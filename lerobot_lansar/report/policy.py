@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..command import CommandError
+from .published import GRIPPER, ROBOT, SCENE, STATIC
 
 MANIFEST = "meta/calvin_source.json"
 """The file in which `lansar-convert` says where a dataset's pictures come from."""
@@ -19,21 +20,26 @@ class Policy:
 
     Args:
         path: `--policy.path` of its evaluation.
+        download: Whether to ask the hub for what is not on this machine.
 
     Raises:
         CommandError: There is no policy.
     """
 
-    def __init__(self, path: str):
+    def __init__(self, path: str, download: bool = True):
+        self._download = download
         try:
-            file = _file(path, "config.json")
+            file = self._file(path, "config.json")
         except (OSError, ValueError) as error:
             raise CommandError(
                 f"--policy_path={path} is neither a pretrained_model folder with a config.json nor a policy that "
                 f"the hub returns: {error}"
             ) from error
         self._path = path
-        self._config = json.loads(file.read_text())
+        try:
+            self._config = json.loads(file.read_text())
+        except ValueError as error:
+            raise CommandError(f"{file} is not JSON: {error}") from error
         self._inputs = self._config.get("input_features") or {}
 
     @property
@@ -41,6 +47,24 @@ class Policy:
         """Whether it reads the simulator's own state."""
         # LanSAR may ignore the scene state although its inputs include it.
         return self._config.get("use_spatial_context", True) and "observation.environment_state" in self._inputs
+
+    @property
+    def reads(self) -> list[str]:
+        """Its inputs beside language, in the words of `published`."""
+        pictures = [key for key in self._inputs if key.startswith("observation.image")]
+        if self._config.get("use_images"):  # LanSAR sees both cameras, through embeddings that are not among its inputs
+            found = [STATIC, GRIPPER]
+        else:
+            cameras = {STATIC: "static", GRIPPER: "gripper"}
+            found = [words for words, camera in cameras.items() if any(camera in key for key in pictures)]
+            found = found or (["pictures"] if pictures else [])
+        state = [ROBOT] if "observation.state" in self._inputs else []
+        return [*found, *state, *([SCENE] if self.reads_scene_state else [])]
+
+    @property
+    def action_steps(self) -> int:
+        """How many actions it carries out before it looks again."""
+        return int(self._config.get("n_action_steps") or 1)
 
     def trained_look(self) -> dict[str, Any] | None:
         """What is known of `LOOK` for the pictures that it was trained on; None if it reads none or nothing is known.
@@ -50,12 +74,30 @@ class Policy:
         if not any(key.startswith("observation.image") for key in self._inputs):
             return None
         try:
-            dataset = json.loads(_file(self._path, "train_config.json").read_text())["dataset"]
-            look = json.loads(_manifest(dataset).read_text())["look"]
+            dataset = json.loads(self._file(self._path, "train_config.json").read_text())["dataset"]
+            look = json.loads(self._manifest(dataset).read_text())["look"]
         except (OSError, ValueError, KeyError):
             return None
         known = {key: look[key] for key in LOOK if look.get(key) is not None}
         return {"image_size": 0, **known} if "image_size" in look else known  # 0 or none: the cameras' own
+
+    def _manifest(self, dataset: dict[str, Any]) -> Path:
+        """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
+        cache = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "lerobot"
+        root = dataset.get("root") or Path(os.environ.get("HF_LEROBOT_HOME", cache)) / dataset["repo_id"]
+        file = Path(root).expanduser() / MANIFEST
+        return file if file.is_file() else self._fetch(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
+
+    def _file(self, path: str, name: str) -> Path:
+        """A policy's file: in a folder, or else from the hub."""
+        file = Path(path) / name
+        return file if file.is_file() else self._fetch(path, name)
+
+    def _fetch(self, repo_id: str, name: str, kind: str = "model", revision: str | None = None) -> Path:
+        from huggingface_hub import hf_hub_download  # late: most reports need no hub
+
+        only_here = not self._download
+        return Path(hf_hub_download(repo_id, name, repo_type=kind, revision=revision, local_files_only=only_here))
 
 
 def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None:
@@ -63,7 +105,7 @@ def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None
 
     Args:
         trained: What `Policy.trained_look` returned.
-        settings: The evaluation's, as `summarise` returns them. What either lacks is not compared.
+        settings: The evaluation's. What either lacks is not compared.
     """
     found = []
     for key, wanted in trained.items():
@@ -78,23 +120,3 @@ def differences(trained: dict[str, Any], settings: dict[str, Any]) -> str | None
 def _same_look(value: Any) -> Any:
     """Our renderers and PyBullet's of the same name have one look."""
     return value.removeprefix("pybullet_") if isinstance(value, str) else value
-
-
-def _manifest(dataset: dict[str, Any]) -> Path:
-    """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
-    cache = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "lerobot"
-    root = dataset.get("root") or Path(os.environ.get("HF_LEROBOT_HOME", cache)) / dataset["repo_id"]
-    file = Path(root).expanduser() / MANIFEST
-    return file if file.is_file() else _download(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
-
-
-def _file(path: str, name: str) -> Path:
-    """A policy's file: in a folder, or else downloaded from the hub."""
-    file = Path(path) / name
-    return file if file.is_file() else _download(path, name)
-
-
-def _download(repo_id: str, name: str, kind: str = "model", revision: str | None = None) -> Path:
-    from huggingface_hub import hf_hub_download  # late: most reports need no hub
-
-    return Path(hf_hub_download(repo_id, name, repo_type=kind, revision=revision))

@@ -1,142 +1,159 @@
-"""`lansar-report`: the tables and plots of one evaluation."""
+"""`lansar-report`: tables, plots and a page of evaluations."""
 
 import json
 import sys
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import draccus
 
-from ..benchmark import EPISODES_FILE, load_chains
-from ..command import run_command
-from .policy import Policy, differences
-from .results import DEFAULT_SEED, collect, read_eval_info, read_lines, summarise
+from ..command import CommandError, run_command
+from .curves import read_training
+from .evaluation import Evaluation, group, merge, read_part, set_labels
+from .markdown import as_markdown
+from .options import EvaluationConfig, ReportConfig, TableConfig, as_list, check, output_dir
+from .tables import build, describe
 
-
-@dataclass
-class ReportConfig:
-    """Success rates of one evaluation on the CALVIN desk, printed and saved with two plots."""
-
-    # Folder of eval_info.json: --output_dir of the lerobot-eval run.
-    eval_dir: Path
-    # Where to write report.json, report.md and the plots; eval_dir by default.
-    output_dir: Path | None = None
-    # Folder of episodes.jsonl: --env.results_dir of that run; eval_dir by default.
-    results_dir: Path | None = None
-    # Seed of that run; by default the smallest seed in episodes.jsonl, or LeRobot's default, 1000.
-    seed: int | None = None
-    # Policy of that run (--policy.path), a folder or a name on the hub. With it, the report states whether the policy
-    # reads the simulator's own state, and whether it was evaluated in the look of its dataset.
-    policy_path: str | None = None
+Described = tuple[Evaluation, dict[str, Any]]
+"""An evaluation and its entry in `report.json`."""
 
 
 def report(config: ReportConfig) -> dict[str, Any]:
-    """Writes `report.json`, `report.md`, `tasks.png` and, for chains, `in_a_row.png`.
+    """Writes `report.html`, `report.json` and `report.md`, and pushes the results if asked to.
 
     Args:
         config: The command's options.
 
     Returns:
-        The content of `report.json`: what `summarise` returns, notes and the package's version.
+        The content of `report.json`: {"title", "lerobot_policy_lansar": version, "left_out": [what a file with tables
+        names and is not there], "tables": what `build` returns, "trainings": what `read_training` returns}.
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: A file is malformed, or the files are of different evaluations.
-        CommandError: There is no policy at `policy_path`.
+        ValueError: A file is malformed, or files are of different evaluations.
+        CommandError: Options contradict each other, or there is no such policy.
     """
-    results_dir = config.results_dir or config.eval_dir
-    if not results_dir.is_dir():
-        raise FileNotFoundError(f"--results_dir={results_dir} is not a folder")
-    entries, lines = read_eval_info(config.eval_dir), read_lines(results_dir)
-    if config.results_dir and not lines:
-        raise FileNotFoundError(f"--results_dir={results_dir} holds no {EPISODES_FILE}")
-    summary = summarise(collect(entries, lines, config.seed))
-    policy = None if config.policy_path is None else Policy(config.policy_path)
-    summary["policy_reads_scene_state"] = None if policy is None else policy.reads_scene_state
-    summary["trained_look"] = None if policy is None else policy.trained_look()
-    summary["notes"] = _notes(summary, chains_known=config.seed is not None or bool(lines))
-    summary["lerobot_policy_lansar"] = version("lerobot_policy_lansar")
-
-    output_dir = config.output_dir or config.eval_dir
-    output_dir.mkdir(parents=True, exist_ok=True)
-    (output_dir / "report.json").write_text(json.dumps(summary, indent=2) + "\n")
-    (output_dir / "report.md").write_text(as_markdown(summary))
-    from .plots import plot_in_a_row, plot_tasks  # matplotlib takes a second to import
-
-    plot_tasks(summary, output_dir / "tasks.png")
-    if "in_a_row" in summary:
-        plot_in_a_row(summary, output_dir / "in_a_row.png")
-    return summary
-
-
-def _notes(summary: dict[str, Any], chains_known: bool) -> list[str]:
-    """What a reader must know; without `chains_known`, the chains follow from LeRobot's default seed."""
-    notes = []
-    assets = summary["settings"]["assets"]
-    if assets != "original":
-        desk = "the built-in desk" if assets == "built-in" else "a desk that the files do not name"
-        notes.append(f"Measured on {desk}: not comparable with published CALVIN numbers.")
-    if summary["policy_reads_scene_state"]:
-        notes.append("The policy reads the simulator's own scene state (privileged), which a real robot does not have.")
-    elif summary["policy_reads_scene_state"] is None:
-        notes.append("Whether the policy reads privileged scene state is unknown: give --policy_path.")
-    other_look = differences(summary["trained_look"] or {}, summary["settings"])
-    if other_look is not None:
-        notes.append(f"The policy was trained on pictures of another look than it was evaluated on: {other_look}.")
-    if summary["ended_early"]:
-        notes.append(
-            f"{summary['ended_early']} episodes failed because the desk refused an action or the simulation diverged: "
-            f"see `reason` in {EPISODES_FILE}."
+    check(config)
+    folder = output_dir(config)
+    left_out: list[str] = []
+    tables, described = _tables(config, left_out)
+    content = {
+        "title": config.title,
+        "lerobot_policy_lansar": version("lerobot_policy_lansar"),
+        "left_out": left_out,
+        "tables": tables,
+        "trainings": _trainings(config, left_out),
+    }
+    if not tables and not content["trainings"]:
+        raise CommandError("nothing to report yet: " + "; ".join(left_out))
+    if config.push_to_hub is not None and len(described) != 1:
+        raise CommandError(
+            f"--push_to_hub writes the results of one evaluation, but these are {len(described)}: report the one alone"
         )
-    if "in_a_row" in summary and not chains_known:
-        notes.append(
-            "The files do not say which chains these are: success per task is right only if --seed was "
-            f"{DEFAULT_SEED}, LeRobot's default. Give lansar-report the --seed of the evaluation."
+    texts = {"report.json": json.dumps(content, indent=2) + "\n", "report.md": as_markdown(content)}
+    from .page import as_html  # matplotlib and jinja2 take a second to import
+
+    texts["report.html"] = as_html(content, described, folder)
+    _write(folder, texts)
+    if config.push_to_hub is not None:
+        from .hub import push
+
+        push(config.push_to_hub, described[0][1])
+    return content
+
+
+def _tables(config: ReportConfig, left_out: list[str]) -> tuple[list[dict[str, Any]], list[Described]]:
+    """The tables, and every evaluation in them once; notes in `left_out` what is not there."""
+    if config.tables:
+        return _tables_of_file(config.tables, left_out)
+    folders, policies = as_list(config.eval_dir), config.policy_path
+    if not folders:
+        return [], []
+    per_folder = policies if isinstance(policies, list) else [policies] * len(folders)
+    pairs = zip(folders, per_folder, strict=True)
+    parts = [read_part(Path(name), config.seed, policy) for name, policy in pairs]
+    named = sorted({part.named for part in parts if part.named is not None})
+    if isinstance(policies, str) and len(named) > 1:
+        raise CommandError(
+            f"--policy_path names one policy, but the evaluations name {len(named)}: {', '.join(named)}. Give a list "
+            "with one for each folder of --eval_dir, or leave it out"
         )
-    if "in_a_row" in summary and summary["episodes"] < len(load_chains()):
-        notes.append(f"{summary['episodes']} of the benchmark's {len(load_chains())} chains.")
-    return notes
+    evaluations = group(parts)
+    _name(evaluations, as_list(config.labels))
+    described = [(evaluation, describe(evaluation, policies is not None)) for evaluation in evaluations]
+    title = described[0][0].label if len(described) == 1 else "Comparison"
+    return [build(title, described, as_list(config.published))], described
 
 
-def as_markdown(summary: dict[str, Any]) -> str:
-    """The report as text.
+def _name(evaluations: list[Evaluation], labels: list[str]) -> None:
+    if labels and len(labels) != len(evaluations):
+        folders = "; ".join(" and ".join(str(part.folder) for part in e.parts) for e in evaluations)
+        raise CommandError(
+            f"--labels has {len(labels)} names, but there are {len(evaluations)} evaluations: {folders}. Name each"
+        )
+    for evaluation, label in zip(evaluations, labels, strict=False):
+        evaluation.label = label
+    set_labels(evaluations)
 
-    Args:
-        summary: What `report` returns.
-    """
-    known = {key: value for key, value in summary["settings"].items() if value is not None}
-    first, last = summary["seeds"]
-    facts = [f"{summary['episodes']} episodes", f"seeds {first} to {last}"]
-    facts += [f"{key.replace('_', ' ')} {value}" for key, value in known.items()]
-    lines = ["# Evaluation on the CALVIN desk", "", "; ".join(facts) + ".", ""]
-    lines += [f"* {note}" for note in summary["notes"]]
-    if "in_a_row" in summary:
-        shares = " | ".join(f"{100 * share:.1f} %" for share in summary["in_a_row"])
-        lines += ["", "| in a row | 1 | 2 | 3 | 4 | 5 | average length |", "| --- " * 7 + "|"]
-        lines += [f"| chains | {shares} | {summary['average_length']:.3f} |"]
-    width = max(len(task) for task in summary["tasks"])
-    lines += [
-        "",
-        f"| {'task':{width}} | successes | attempts | rate    |",
-        f"| {'-' * width} | --------- | -------- | ------- |",
-    ]
-    for task, c in summary["tasks"].items():
-        lines.append(f"| {task:{width}} | {c['successes']:9} | {c['attempts']:8} | {100 * c['rate']:5.1f} % |")
-    lines += [
-        "",
-        f"Local success rate (all attempted commands): {100 * summary['local_success_rate']:.2f} %",
-        "",
-    ]
-    return "\n".join(lines)
+
+def _tables_of_file(configs: list[TableConfig], left_out: list[str]) -> tuple[list[dict[str, Any]], list[Described]]:
+    """Several tables may show the same evaluation, which is then read once."""
+    known: dict[tuple[Any, ...], Described] = {}
+
+    def read(row: EvaluationConfig) -> Described:
+        key = (tuple(as_list(row.eval_dir)), row.policy_path, row.seed)
+        if key not in known:
+            parts = [read_part(Path(name), row.seed, row.policy_path) for name in key[0]]
+            evaluation = merge(parts, row.label)
+            known[key] = evaluation, describe(evaluation, row.policy_path is not None)
+        evaluation, entry = known[key]
+        return evaluation, {**entry, "label": row.label}
+
+    tables = []
+    for table in configs:
+        if not table.evaluations:
+            raise CommandError(f"the table {table.title!r} names no evaluations")
+        try:
+            rows = [read(row) for row in table.evaluations]
+        except FileNotFoundError as error:
+            left_out.append(f"{table.title} ({error})")
+            continue
+        tables.append(build(table.title, rows, as_list(table.published), table.tasks))
+    shown = {folder for table in tables for row in table["evaluations"] for folder in row["folders"]}
+    return tables, [pair for pair in known.values() if shown.issuperset(pair[1]["folders"])]
+
+
+def _trainings(config: ReportConfig, left_out: list[str]) -> list[dict[str, Any]]:
+    """The losses of trainings; those of a file with tables may be missing."""
+    found = [read_training(Path(name)) for name in as_list(config.train_dir)]
+    for training in config.trainings:
+        try:
+            found.append(read_training(Path(training.train_dir), training.label))
+        except FileNotFoundError as error:
+            left_out.append(f"losses of {training.label} ({error})")
+    return found
+
+
+def _write(folder: Path, texts: dict[str, str]) -> None:
+    """Writes files whole or not at all: each under another name first."""
+    folder.mkdir(parents=True, exist_ok=True)
+    unfinished = {name: folder / f".{name}.unfinished" for name in texts}
+    try:
+        for name, path in unfinished.items():
+            path.write_text(texts[name], encoding="utf-8")
+        for name, path in unfinished.items():
+            path.replace(folder / name)
+    finally:
+        for path in unfinished.values():
+            path.unlink(missing_ok=True)
 
 
 @draccus.wrap()
 def run(config: ReportConfig) -> None:
     """Writes the report, prints it and says where it is."""
     print(as_markdown(report(config)))
-    print(f"report.json, report.md and the plots are in {config.output_dir or config.eval_dir}")
+    print(f"report.html, report.json and report.md are in {output_dir(config)}")
 
 
 def main() -> int:

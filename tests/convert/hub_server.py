@@ -1,4 +1,5 @@
-"""A small Hugging Face hub on loopback: enough of its HTTP interface for the real client to push and load datasets.
+"""A small Hugging Face hub on loopback: enough of its HTTP interface for the real client to push and load datasets,
+and to rewrite the cards of models.
 
 It keeps repositories in memory as git does (commits that map paths to blobs), large files by SHA-256, and checks what
 it receives: sizes and hashes of LFS objects, that a commit names only objects that were uploaded, that a card's header
@@ -94,17 +95,17 @@ class _Handler(BaseHTTPRequestHandler):
         ("POST", r"/api/repos/create", "create"),
         ("GET", r"/api/whoami-v2", "whoami"),
         ("POST", r"/api/validate-yaml", "validate_yaml"),
-        ("POST", r"/api/datasets/([^/]+/[^/]+)/preupload/([^/]+)", "preupload"),
+        ("POST", r"/api/(?:datasets|models)/([^/]+/[^/]+)/preupload/([^/]+)", "preupload"),
         ("POST", r"/datasets/([^/]+/[^/]+)\.git/info/lfs/objects/batch", "lfs_batch"),
         ("PUT", r"/lfs/([0-9a-f]{64})", "lfs_put"),
         ("POST", r"/lfs/([0-9a-f]{64})/verify", "lfs_verify"),
-        ("POST", r"/api/datasets/([^/]+/[^/]+)/commit/([^/]+)", "commit"),
+        ("POST", r"/api/(?:datasets|models)/([^/]+/[^/]+)/commit/([^/]+)", "commit"),
         ("POST", r"/api/datasets/([^/]+/[^/]+)/tag/([^/]+)", "tag"),
         ("DELETE", r"/api/datasets/([^/]+/[^/]+)/tag/([^/]+)", "untag"),
         ("GET", r"/api/datasets/([^/]+/[^/]+)/refs", "refs"),
         ("GET", r"/api/datasets/([^/]+/[^/]+)/tree/([^/]+)", "tree"),
         ("GET", r"/api/datasets/([^/]+/[^/]+)(?:/revision/([^/]+))?", "info"),
-        ("(?:GET|HEAD)", r"/datasets/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", "resolve"),
+        ("(?:GET|HEAD)", r"(?:/datasets)?/([^/]+/[^/]+)/resolve/([^/]+)/(.+)", "resolve"),
     )
 
     def _serve(self) -> None:
