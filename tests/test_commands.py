@@ -166,7 +166,7 @@ def test_a_chain_is_evaluated_and_reported(run, work, lansar):
     assert "rotate_blue_block_right" in printed  # chain 0's first task
     assert "built-in" in printed
     report = json.loads((work / "eval_chain" / "report.json").read_text())
-    assert report["average_length"] == 0
+    assert report["tables"][0]["evaluations"][0]["average_length"] == 0
     assert list((work / "eval_chain").rglob("*.mp4"))
 
 

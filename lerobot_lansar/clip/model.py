@@ -92,8 +92,7 @@ class Clip:
         if weights is None and config.pretrained and not tag and not Path(config.pretrained).is_file():
             tags = ", ".join(open_clip.list_pretrained_tags_by_model(config.model)) or "it has none"
             raise ValueError(
-                f"clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of "
-                f"{config.model} ({tags})."
+                f"clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of {config.model} ({tags})."
             )
         # open_clip warns about random weights; here that is intended, or a checkpoint follows.
         with torch.random.fork_rng(devices=[]), _quiet_logging():

@@ -1,10 +1,9 @@
 """Training and held-out losses of any LeRobot training, from what it left in its folder.
 
-In this order: `losses.csv` in a checkpoint, which LanSAR writes; the file that wandb keeps on this machine; a log,
+In this order: `losses.json` in a checkpoint, which LanSAR writes; the file that wandb keeps on this machine; a log,
 which is what `lerobot-train` printed.
 """
 
-import csv
 import json
 import math
 import re
@@ -14,7 +13,7 @@ from typing import Any
 
 from ..command import CommandError
 
-LOSSES_FILE = "losses.csv"
+LOSSES_FILE = "losses.json"
 
 Losses = tuple[dict[int, float], dict[int, float]]
 """Update to loss, of training and of held-out data."""
@@ -75,7 +74,7 @@ def _from_folder(folder: Path) -> tuple[str, Losses]:
     newest = sorted(checkpoints.glob(f"[0-9]*/pretrained_model/{LOSSES_FILE}"), key=lambda p: int(p.parts[-3]))
     for path in (checkpoints / "last" / "pretrained_model" / LOSSES_FILE, *reversed(newest)):
         if path.is_file():
-            return path.relative_to(folder).as_posix(), _from_csv(path)
+            return path.relative_to(folder).as_posix(), _from_json(path)
     runs = sorted(folder.glob("wandb/*run-*/run-*.wandb"), key=lambda path: path.parent.name.removeprefix("offline-"))
     runs = [run for run in runs if not run.parent.is_symlink()]
     if runs:
@@ -86,17 +85,16 @@ def _from_folder(folder: Path) -> tuple[str, Losses]:
     return ", ".join(log.name for log in logs), _from_logs(logs)
 
 
-def _from_csv(path: Path) -> Losses:
+def _from_json(path: Path) -> Losses:
     training: dict[int, float] = {}
     held_out: dict[int, float] = {}
-    with open(path, newline="") as file:
-        for number, row in enumerate(csv.DictReader(file), start=2):
-            try:
-                for losses, column in ((training, "training"), (held_out, "held_out")):
-                    if row[column]:
-                        losses[int(row["update"])] = float(row[column])
-            except (KeyError, ValueError, TypeError) as error:
-                raise ValueError(f"{path}, line {number}: not update, training, held_out ({error!r})") from error
+    try:
+        for entry in json.loads(path.read_text()):
+            for losses, kind in ((training, "training"), (held_out, "held_out")):
+                if kind in entry:
+                    losses[int(entry["update"])] = float(entry[kind])
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: not LanSAR's list of losses by update ({error!r})") from error
     return training, held_out
 
 

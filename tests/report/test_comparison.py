@@ -114,9 +114,9 @@ def run_thesis(tmp_path, monkeypatch, capsys, request):
 def test_one_file_makes_all_of_the_thesis_tables(tmp_path, monkeypatch, capsys, request):
     perturbed = ("perturbed_5_50", "perturbed_2.5_25", "perturbed_0.5_5")
     thesis_evaluations(tmp_path, "baseline", "prepended", "no_space", "no_images", "abc", *perturbed)
-    losses = tmp_path / "outputs/thesis/baseline/checkpoints/last/pretrained_model/losses.csv"
+    losses = tmp_path / "outputs/thesis/baseline/checkpoints/last/pretrained_model/losses.json"
     losses.parent.mkdir(parents=True)
-    losses.write_text("update,training,held_out\n100,0.5,\n200,0.4,0.6\n")
+    losses.write_text('[{"update": 100, "training": 0.5}, {"update": 200, "training": 0.4, "held_out": 0.6}]')
     code, printed = run_thesis(tmp_path, monkeypatch, capsys, request)
     assert code == 0, printed.err
     content = json.loads((tmp_path / "outputs/report/thesis/report.json").read_text())

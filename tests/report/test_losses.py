@@ -1,7 +1,9 @@
 """Losses of trainings, from each source that LeRobot and LanSAR leave behind."""
 
 import json
+import math
 import re
+import time
 
 import pytest
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
@@ -19,6 +21,18 @@ def checkpoint(folder, step, **files):
     return folder
 
 
+def kept(*rows):
+    """What LanSAR writes: (update, training loss, held-out loss) rows, where None is left out."""
+    kinds = ("training", "held_out")
+    entries = [
+        {"update": row[0], kind: loss}
+        for row in rows
+        for kind, loss in zip(kinds, row[1:], strict=False)
+        if loss is not None
+    ]
+    return json.dumps(entries)
+
+
 def printed(steps, losses, log_freq=200):
     """What `lerobot-train` prints, made by its own tracker."""
     lines = [f" 'log_freq': {log_freq},"]
@@ -31,27 +45,27 @@ def printed(steps, losses, log_freq=200):
 
 
 def test_losses_that_lansar_wrote_come_first(tmp_path):
-    checkpoint(tmp_path, "000100", losses__csv="update,training,held_out\n10,0.9,\n")
-    checkpoint(tmp_path, "000200", losses__csv="update,training,held_out\n10,0.9,\n20,0.5,0.7\n30,,0.6\n")
+    checkpoint(tmp_path, "000100", losses__json=kept((10, 0.9)))
+    checkpoint(tmp_path, "000200", losses__json=kept((10, 0.9), (20, 0.5, 0.7), (30, None, 0.6)))
     (tmp_path / "train.log").write_text(printed([200], [0.1]))
     found = read_training(tmp_path, "mine")
-    assert (found["label"], found["source"]) == ("mine", "checkpoints/000200/pretrained_model/losses.csv")
+    assert (found["label"], found["source"]) == ("mine", "checkpoints/000200/pretrained_model/losses.json")
     assert found["training"] == [[10, 0.9], [20, 0.5]]
     assert found["held_out"] == [[20, 0.7], [30, 0.6]]
-    checkpoint(tmp_path, "last", losses__csv="update,training,held_out\n1,2,3\n")
+    checkpoint(tmp_path, "last", losses__json=kept((1, 2, 3)))
     assert read_training(tmp_path)["training"] == [[1, 2.0]], "last is the newest, whatever its number"
 
 
 def test_losses_that_are_not_finite_are_kept_as_unknown(tmp_path):
-    checkpoint(tmp_path, "last", losses__csv="update,training,held_out\n1,nan,\n2,0.5,inf\n")
+    checkpoint(tmp_path, "last", losses__json=kept((1, math.nan), (2, 0.5, math.inf)))
     content = report(ReportConfig(train_dir=str(tmp_path)))
     assert content["trainings"][0]["training"] == [[1, None], [2, 0.5]]
     json.loads((tmp_path / "report.json").read_text(), parse_constant=pytest.fail)
 
 
 def test_a_malformed_file_is_named(tmp_path):
-    checkpoint(tmp_path, "last", losses__csv="update,training,held_out\n1,high,\n")
-    with pytest.raises(ValueError, match=r"losses\.csv, line 2"):
+    checkpoint(tmp_path, "last", losses__json=kept((1, "high")))
+    with pytest.raises(ValueError, match=r"losses\.json: not LanSAR"):
         read_training(tmp_path)
 
 
@@ -89,7 +103,9 @@ def test_the_file_that_wandb_keeps_is_read(tmp_path, monkeypatch):
             run.log({"train/loss": 10 / step, "train/steps": step}, step=step)
         run.log({"eval/eval_loss": 0.75}, step=200)
     (tmp_path / "train.log").write_text(printed([200], [9.0]))
-    found = read_training(tmp_path)
+    deadline = time.time() + 30
+    while not (found := read_training(tmp_path))["held_out"] and time.time() < deadline:
+        time.sleep(0.1)  # wandb's own process may still be writing
     assert found["training"] == [[100, 0.1], [200, 0.05]]
     assert found["held_out"] == [[200, 0.75]]
     (file,) = tmp_path.glob("wandb/offline-run-*/run-*.wandb")
@@ -107,9 +123,7 @@ def test_a_training_that_left_nothing_says_how_to_get_losses(tmp_path):
 def test_several_trainings_are_plotted_together(tmp_path):
     folders = []
     for name in ("a", "b"):
-        folders.append(
-            str(checkpoint(tmp_path / name, "last", losses__csv="update,training,held_out\n1,2,\n2,1,1.5\n"))
-        )
+        folders.append(str(checkpoint(tmp_path / name, "last", losses__json=kept((1, 2), (2, 1, 1.5)))))
     report(ReportConfig(train_dir=folders, output_dir=tmp_path / "out"))
     page = (tmp_path / "out/report.html").read_text()
     for entry in ("a, training", "a, held out", "b, training", "b, held out"):
