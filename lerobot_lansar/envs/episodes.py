@@ -29,20 +29,6 @@ def append_episode(folder: Path, episode: dict[str, Any]) -> None:
         file.write(line.encode())
 
 
-def read_episodes(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a folder's `episodes.jsonl`, without the beginning of one that a killed process left at its end.
-
-    Raises:
-        ValueError: A line is damaged.
-    """
-    file = folder / EPISODES_FILE
-    lines = file.read_text().split("\n")[:-1] if file.is_file() else []
-    try:
-        return [json.loads(line) for line in lines]
-    except ValueError as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
-
-
 def _whole_lines(file: BinaryIO) -> int:
     """How many bytes of a file are whole lines."""
     end = file.seek(0, os.SEEK_END)

@@ -22,15 +22,13 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from ..benchmark import EPISODES_FILE, LH_MTLC
 from ..calvin import CHAIN_LENGTH
 from ..command import CommandError, run_command
-from ..envs.episodes import read_episodes
 from ..jobs.executors import run_shards
 from ..jobs.staging import end_submitted, refuse_submitted, submitted_jobs, write_atomically
+from ..report.episodes import INFO_FILE, PLAN_FILE, read_lines
+from ..report.episodes import Episode as Played
 from .options import EvaluateConfig
 from .stream import Episode
-from .worker import evaluate_shard, finished, line_task
-
-CONFIG_FILE = "eval_config.json"
-"""File in OUTPUT_DIR: which evaluation its lines belong to, for `lansar-report` and for the next run."""
+from .worker import evaluate_shard
 
 _STATE = ".lansar-eval"
 """Hidden folder in OUTPUT_DIR: the lock, the mark of submitted jobs, their logs."""
@@ -68,11 +66,10 @@ def _evaluate(config: EvaluateConfig) -> Path:
     folder, desk = config.folder, config.desk
     env_options = desk.gym_kwargs
     env_options["results_extra"] = {**env_options["results_extra"], "policy_reset": "command"}
-    if desk.assets is not None:
-        env_options["assets"] = str(Path(desk.assets).resolve())
     _claim(config, env_options["results_extra"]["policy"])
+    _make_paths_absolute(config, env_options)
     episodes = planned(config)
-    done = finished(config)
+    done = {episode.key for episode in read_lines(folder)}
     missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
     started = time.time()
     config.workers = min(config.workers or 1, max(1, len(missing)))
@@ -93,8 +90,19 @@ def _evaluate(config: EvaluateConfig) -> Path:
             status=lambda: _mean(_counted(config), desk.suites()),
         )
     if not complete:
-        print(f"submitted; {folder / 'eval_info.json'} appears when the jobs are done")
+        print(f"submitted; {folder / INFO_FILE} appears when the jobs are done")
     return folder
+
+
+def _make_paths_absolute(config: EvaluateConfig, env_options: dict[str, Any]) -> None:
+    """For jobs, which may run in another working directory."""
+    for name in ("assets", "annotations"):
+        if env_options[name] is not None:
+            env_options[name] = str(Path(env_options[name]).resolve())
+    assert config.policy is not None
+    path = Path(str(config.policy.pretrained_path))
+    if path.is_dir():
+        config.policy.pretrained_path = path.resolve()
 
 
 def planned(config: EvaluateConfig) -> list[Episode]:
@@ -110,27 +118,26 @@ def planned(config: EvaluateConfig) -> list[Episode]:
     return found
 
 
-def _counted(config: EvaluateConfig) -> list[dict[str, Any]]:
-    """The lines of planned episodes, one each; an earlier run may have played more."""
+def _counted(config: EvaluateConfig) -> list[Played]:
+    """The planned episodes that have a line; an earlier run may have played more."""
     wanted = {(episode.task, episode.seed) for episode in planned(config)}
-    lines = {(line_task(line), line["seed"]): line for line in read_episodes(config.folder)}
-    return [line for key, line in lines.items() if key in wanted]
+    return [episode for episode in read_lines(config.folder) if episode.key in wanted]
 
 
-def _mean(lines: list[dict[str, Any]], suites: dict[str, tuple[str, ...]]) -> str:
-    if not lines:
+def _mean(episodes: list[Played], suites: dict[str, tuple[str, ...]]) -> str:
+    if not episodes:
         return ""
-    mean = float(np.mean([line["successes"] for line in lines]))
-    return f"average length {mean:.2f}" if list(suites) == [LH_MTLC] else f"successes {mean:.3f}"
+    mean = float(np.mean([episode.successes for episode in episodes]))
+    return f"average length {mean:.2f}" if list(suites) == [LH_MTLC] else f"success {100 * mean:.1f} %"
 
 
 def _claim(config: EvaluateConfig, policy: str | None) -> None:
-    """Makes the folder that of this evaluation.
+    """Makes the folder that of this evaluation, for the next run and for `lansar-report`.
 
     Raises:
         CommandError: It is that of another one.
     """
-    file = config.folder / CONFIG_FILE
+    file = config.folder / PLAN_FILE
     request = _request(config)
     if file.exists():
         before = json.loads(file.read_text())["request"]
@@ -182,17 +189,18 @@ def write_eval_info(config: EvaluateConfig, started: float, _: int = 0) -> None:
         config: The command's options.
         started: When the command began, in seconds since the epoch.
     """
-    lines = {(line_task(line), line["seed"]): line for line in _counted(config)}
+    played = {episode.key: episode for episode in _counted(config)}
     per_task: list[dict[str, Any]] = []
     groups = {}
     for suite, tasks in config.desk.suites().items():
         for number, task in enumerate(tasks):
             mine = [episode for episode in planned(config) if episode.task == task]
-            rows = [lines[task, episode.seed] for episode in mine]
+            successes = [played[task, episode.seed].successes for episode in mine]
+            all_of_them = CHAIN_LENGTH if task == LH_MTLC else 1
             metrics = {
-                "sum_rewards": [float(row["successes"]) for row in rows],
-                "max_rewards": [float(row["successes"] > 0) for row in rows],
-                "successes": [_is_success(row) for row in rows],
+                "sum_rewards": [float(count) for count in successes],
+                "max_rewards": [float(count > 0) for count in successes],
+                "successes": [count == all_of_them for count in successes],
                 "video_paths": [str(e.video) for e in mine if e.video is not None and e.video.is_file()],
                 "predicted_video_paths": [],
             }
@@ -202,13 +210,8 @@ def write_eval_info(config: EvaluateConfig, started: float, _: int = 0) -> None:
     seconds = time.time() - started
     overall |= {"eval_s": seconds, "eval_ep_s": seconds / overall["n_episodes"]}
     info = {"per_task": per_task, "per_group": groups, "overall": overall}
-    write_atomically(config.folder / "eval_info.json", json.dumps(info, indent=2) + "\n")
+    write_atomically(config.folder / INFO_FILE, json.dumps(info, indent=2) + "\n")
     end_submitted(config.folder / _STATE)
-
-
-def _is_success(line: dict[str, Any]) -> bool:
-    wanted = CHAIN_LENGTH if line["chain"] is not None else 1
-    return line["successes"] == wanted
 
 
 def _aggregated(metrics: list[dict[str, Any]]) -> dict[str, Any]:

@@ -11,11 +11,10 @@ from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
-from ..benchmark import LH_MTLC
 from ..calvin import CHAIN_LENGTH
 from ..envs import CalvinEnv
-from ..envs.episodes import read_episodes
 from ..envs.vector import SerialVectorEnv
+from ..report.episodes import read_lines
 from .loading import load_policy
 from .options import EvaluateConfig
 from .rows import ResetAtCommands
@@ -35,7 +34,7 @@ def evaluate_shard(config: EvaluateConfig, env_options: dict, episodes: Sequence
         shard: The worker's number.
     """
     assert config.workers is not None
-    done = finished(config)
+    done = {episode.key for episode in read_lines(config.folder)}
     mine = [episode for episode in episodes[shard :: config.workers] if (episode.task, episode.seed) not in done]
     if not mine:
         return
@@ -43,17 +42,6 @@ def evaluate_shard(config: EvaluateConfig, env_options: dict, episodes: Sequence
     log.parent.mkdir(exist_ok=True)
     with open(log, "w") as file, redirect_stdout(file), redirect_stderr(file):
         _evaluate(config, env_options, mine)
-
-
-def finished(config: EvaluateConfig) -> set[tuple[str, int]]:
-    """Task and seed of every episode that has a line."""
-    lines = read_episodes(config.folder)
-    return {(line_task(line), line["seed"]) for line in lines}
-
-
-def line_task(line: dict) -> str:
-    """The `task` of `CalvinEnv` that a line of `episodes.jsonl` is of."""
-    return line["commands"][0]["task"] if line["chain"] is None else LH_MTLC
 
 
 def _evaluate(config: EvaluateConfig, env_options: dict, episodes: list[Episode]) -> None:
