@@ -11,6 +11,7 @@ import pybullet as p
 import pytest
 
 from lerobot_lansar.desk import Desk, DeskError, SimulationError
+from lerobot_lansar.desk.render import OURS
 from lerobot_lansar.desk.starts import sample_start
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.configuration_calvin import ForkedVectorEnv
@@ -115,8 +116,16 @@ def test_desks_in_one_process_do_not_touch_each_other(desk):
         np.testing.assert_array_equal(desk.render("static"), picture)
 
 
-def test_drawing_does_not_change_the_motion(desk, monkeypatch):
-    fresh, step = motion(desk), desk.step
+@pytest.mark.parametrize("renderer", [*OURS, "pybullet_tiny"])
+def test_drawing_does_not_change_the_motion(desk, monkeypatch, renderer):
+    fresh = motion(desk)
+    with Desk("D", cameras=(), renderer=renderer) as drawn:
+        draw_at_every_step(drawn, monkeypatch)
+        np.testing.assert_array_equal(motion(drawn), fresh)
+
+
+def draw_at_every_step(desk, monkeypatch):
+    step = desk.step
 
     def step_and_draw(action, control_mode="rel"):
         obs = step(action, control_mode)
@@ -124,7 +133,6 @@ def test_drawing_does_not_change_the_motion(desk, monkeypatch):
         return obs
 
     monkeypatch.setattr(desk, "step", step_and_draw)
-    np.testing.assert_array_equal(motion(desk), fresh)
 
 
 def test_a_diverging_simulation_is_an_error_and_a_reset_repairs_it(desk):
