@@ -155,6 +155,7 @@ class CalvinEnv(gym.Env):
         self._sentences = load_commands(annotations, "validation")
         self.task_description = "" if task == LH_MTLC else self._sentences[task][0]
         self._open_desk = functools.partial(Desk, scene, assets, self.pictures.cameras, renderer, depth)
+        self._is_new = True  # until its first step
         self._desk: Desk | None = None  # opened at the first reset, in the process that steps it
         self._commands: tuple[str, ...] = ()  # tasks of the episode; empty when none is under way
         self._outcomes: list[dict[str, Any]] = []  # of the commands that ended, in order
@@ -204,13 +205,14 @@ class CalvinEnv(gym.Env):
         """One control step of 1/30 s.
 
         Raises:
-            DeskError: The environment was not reset; the action is not (7,); an episode's first action plainly
-                belongs to the other control mode.
+            DeskError: The environment was not reset; the action is not (7,); the environment's very first action
+                plainly belongs to the other control mode.
         """
         if self._desk is None or not self._commands:
             raise DeskError("reset the environment before stepping it")
-        if self._steps == 0 and _is_action(action):  # a wild action fails its own episode instead, in `_advance`
+        if self._is_new and _is_action(action):  # a wild action fails its own episode instead, in `_advance`
             refuse_other_mode(np.asarray(action, dtype=np.float64), self.control_mode)
+        self._is_new = False
         if self.perturbation_every and (self._steps + 1) % self.perturbation_every == 0:
             action = self._perturbed(np.array(action, dtype=np.float64))
         self._advance(self._desk, action)
@@ -238,8 +240,8 @@ class CalvinEnv(gym.Env):
             self._reason = str(error)
         if self._reason is not None:
             warnings.warn(
-                "episodes fail early: the desk refuses the policy's actions, or its simulation diverges. With "
-                "--env.results_dir, episodes.jsonl holds each episode's reason",
+                "episodes fail early: the desk refuses the policy's actions, or its simulation diverges; `reason` in "
+                "the lines of episodes.jsonl tells which (lerobot-eval writes them with --env.results_dir)",
                 stacklevel=3,
             )
 
@@ -327,7 +329,10 @@ class CalvinEnv(gym.Env):
         return sum(outcome["success"] for outcome in self._outcomes)
 
     def result(self) -> dict[str, Any]:
-        """The line of `episodes.jsonl` that describes the episode: what was commanded, what became of it, settings."""
+        """The line of `episodes.jsonl` that describes the episode: what was commanded, what became of it, settings.
+
+        `end` is the state in which the episode ended; `Desk.reset` takes it.
+        """
         assert self._desk is not None
         return {
             "seed": self._seed,
@@ -336,6 +341,7 @@ class CalvinEnv(gym.Env):
             "commands": self._outcomes,
             "successes": self._successes(),
             "reason": self._reason,
+            "end": {key: self._last[key].tolist() for key in ("robot_obs", "scene_obs")},
             "assets": self._desk.assets,
             "renderer": self._desk.renderer if self._desk.cameras else None,
             "image_size": self.pictures.image_size if self._desk.cameras else None,

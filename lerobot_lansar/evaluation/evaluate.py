@@ -22,6 +22,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from ..benchmark import EPISODES_FILE, LH_MTLC
 from ..calvin import CHAIN_LENGTH
 from ..command import CommandError, run_command
+from ..envs.command_line import evaluated_policy
 from ..jobs.executors import run_shards
 from ..jobs.staging import end_submitted, refuse_submitted, submitted_jobs, write_atomically
 from ..report.episodes import INFO_FILE, PLAN_FILE, read_lines
@@ -34,13 +35,15 @@ _STATE = ".lansar-eval"
 """Hidden folder in OUTPUT_DIR: the lock, the mark of submitted jobs, their logs."""
 _MAY_CHANGE = ("output_dir", "job_name", "workers", "executor", "slurm", "chains", "videos", "eval")
 """Options that decide no episode's result."""
+_ENV_MAY_CHANGE = ("features", "features_map", "render_fps", "render_size")
+"""Those of --env; the first two follow from the others."""
 
 
 def evaluate(config: EvaluateConfig) -> Path:
     """Plays the missing episodes.
 
     What an episode's line says depends on the policy, the options and the seed, not on the number of workers or on
-    interruptions. (LanSAR computes the same to the last digit for batches of 4 and more on a CPU.)
+    interruptions.
 
     Returns:
         The output folder, with `episodes.jsonl`, `eval_config.json`, videos and, when all episodes are played,
@@ -51,6 +54,7 @@ def evaluate(config: EvaluateConfig) -> Path:
         WorkerDied: A worker was killed.
     """
     config.check()
+    config.desk.get_env_processors()  # compares the environment with the policy
     folder = config.folder
     state = folder / _STATE
     state.mkdir(parents=True, exist_ok=True)
@@ -66,29 +70,36 @@ def _evaluate(config: EvaluateConfig) -> Path:
     folder, desk = config.folder, config.desk
     env_options = desk.gym_kwargs
     env_options["results_extra"] = {**env_options["results_extra"], "policy_reset": "command"}
-    _claim(config, env_options["results_extra"]["policy"])
+    seconds = _claim(config)
     _make_paths_absolute(config, env_options)
     episodes = planned(config)
     done = {episode.key for episode in read_lines(folder)}
     missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
-    started = time.time()
+    if not missing and (folder / INFO_FILE).exists():
+        return folder
+    (folder / INFO_FILE).unlink(missing_ok=True)  # of an evaluation with fewer episodes
     config.workers = min(config.workers or 1, max(1, len(missing)))
     executor = config.executor if missing else "local"
-    with submitted_jobs(folder / _STATE, submitting=executor == "slurm"):
-        complete = run_shards(
-            (evaluate_shard, (config, env_options, missing)),
-            config.workers if missing else 0,
-            (write_eval_info, (config, started)),
-            executor=executor,
-            workers=config.workers,
-            slurm=config.slurm,
-            logging_dir=folder / _STATE / "jobs",
-            progress=lambda: len(_counted(config)),
-            total=len(episodes),
-            unit="chain" if list(desk.suites()) == [LH_MTLC] else "episode",
-            desc="evaluating",
-            status=lambda: _mean(_counted(config), desk.suites()),
-        )
+    started = time.time() - seconds
+    try:
+        with submitted_jobs(folder / _STATE, submitting=executor == "slurm"):
+            complete = run_shards(
+                (evaluate_shard, (config, env_options, missing)),
+                config.workers if missing else 0,
+                (write_eval_info, (config, started)),
+                executor=executor,
+                workers=config.workers,
+                slurm=config.slurm,
+                logging_dir=folder / _STATE / "jobs",
+                progress=lambda: len(_counted(config)),
+                total=len(episodes),
+                unit="chain" if list(desk.suites()) == [LH_MTLC] else "episode",
+                desc="evaluating",
+                status=lambda: _mean(_counted(config), desk.suites()),
+            )
+    finally:
+        if executor != "slurm":
+            _note_seconds(folder, time.time() - started)
     if not complete:
         print(f"submitted; {folder / INFO_FILE} appears when the jobs are done")
     return folder
@@ -131,55 +142,74 @@ def _mean(episodes: list[Played], suites: dict[str, tuple[str, ...]]) -> str:
     return f"average length {mean:.2f}" if list(suites) == [LH_MTLC] else f"success {100 * mean:.1f} %"
 
 
-def _claim(config: EvaluateConfig, policy: str | None) -> None:
+def _claim(config: EvaluateConfig) -> float:
     """Makes the folder that of this evaluation, for the next run and for `lansar-report`.
+
+    Returns:
+        How many seconds earlier runs have taken.
 
     Raises:
         CommandError: It is that of another one.
     """
     file = config.folder / PLAN_FILE
-    request = _request(config)
-    if file.exists():
-        before = json.loads(file.read_text())["request"]
-        if before != request:
-            others = ", ".join(_differences(before, request))
+    request, seconds = _request(config), 0.0
+    if file.exists() and read_lines(config.folder):
+        before = json.loads(file.read_text())
+        if before["request"] != request:
+            others = ", ".join(_differences(before["request"], request))
             raise CommandError(
                 f"{config.folder} holds another evaluation, which differs in {others}: give another --output_dir, or "
                 f"repeat its options ({file})"
             )
-    elif (config.folder / EPISODES_FILE).exists():
-        raise CommandError(f"{config.folder} holds episodes of another evaluation: give another --output_dir")
+        seconds = before.get("seconds") or 0.0
+    elif not file.exists() and any((config.folder / name).exists() for name in (EPISODES_FILE, INFO_FILE)):
+        raise CommandError(f"{config.folder} holds another evaluation: give another --output_dir")
     described = {
-        "policy": policy,
+        "policy": evaluated_policy(),
         "seed": config.seed,
         "n_episodes": config.eval.n_episodes,
         "suites": config.desk.suites(),
         "command": shlex.join(["lansar-eval", *sys.argv[1:]]),
         "hardware": f"{len(os.sched_getaffinity(0))} CPU cores, policy on {config.policy and config.policy.device}",
+        "seconds": seconds,
         "version": version("lerobot_policy_lansar"),
         "request": request,
     }
     write_atomically(file, json.dumps(described, indent=2) + "\n")
+    return seconds
+
+
+def _note_seconds(folder: Path, seconds: float) -> None:
+    file = folder / PLAN_FILE
+    described = json.loads(file.read_text()) | {"seconds": round(seconds, 1)}
+    write_atomically(file, json.dumps(described, indent=2) + "\n")
 
 
 def _request(config: EvaluateConfig) -> dict[str, Any]:
-    """What decides the results: options, and the policy's weights where they lie on this machine."""
+    """What decides the results: options, and the content of files that they name."""
     options = {key: value for key, value in draccus.encode(config).items() if key not in _MAY_CHANGE}
+    options["env"] = {key: value for key, value in options["env"].items() if key not in _ENV_MAY_CHANGE}
     assert config.policy is not None
-    weights = Path(str(config.policy.pretrained_path), "model.safetensors")
-    if weights.is_file():
-        with open(weights, "rb") as file:
-            options["weights_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    options["policy"] |= {"pretrained_path": evaluated_policy()}
+    files = sorted(Path(str(config.policy.pretrained_path)).glob("*.safetensors"))
+    options["weights of the policy"] = {file.name: _sha256(file) for file in files}
+    if config.desk.annotations is not None:
+        options["env"]["annotations"] = _sha256(Path(config.desk.annotations))
     return json.loads(json.dumps(options))
 
 
-def _differences(one: Any, other: Any, name: str = "-") -> list[str]:
+def _sha256(file: Path) -> str:
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _differences(one: Any, other: Any, name: str = "") -> list[str]:
     """Names of the options in which two requests differ."""
-    if isinstance(one, dict) and isinstance(other, dict):
+    if isinstance(one, dict) and isinstance(other, dict) and not name.startswith("weights"):
         keys = [*one, *(key for key in other if key not in one)]
-        sub = (_differences(one.get(k), other.get(k), f"{name}{'-' if name == '-' else '.'}{k}") for k in keys)
+        sub = (_differences(one.get(k), other.get(k), f"{name}.{k}" if name else k) for k in keys)
         return [difference for found in sub for difference in found]
-    return [] if one == other else [name]
+    return [] if one == other else [name if " " in name else f"--{name}"]
 
 
 def write_eval_info(config: EvaluateConfig, started: float, _: int = 0) -> None:
@@ -187,7 +217,7 @@ def write_eval_info(config: EvaluateConfig, started: float, _: int = 0) -> None:
 
     Args:
         config: The command's options.
-        started: When the command began, in seconds since the epoch.
+        started: When the evaluation began, earlier runs included, in seconds since the epoch.
     """
     played = {episode.key: episode for episode in _counted(config)}
     per_task: list[dict[str, Any]] = []
@@ -233,6 +263,9 @@ def _aggregated(metrics: list[dict[str, Any]]) -> dict[str, Any]:
 def run(config: EvaluateConfig) -> None:
     """Evaluates and says what to do next."""
     folder = evaluate(config)
+    early = sum(episode.reason is not None for episode in _counted(config))
+    if early:
+        print(f"{early} episodes ended early: `reason` in {os.path.relpath(folder / EPISODES_FILE)} says why")
     print(f"lansar-report --eval_dir={os.path.relpath(folder)} makes the tables")
 
 

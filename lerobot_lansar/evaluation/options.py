@@ -31,7 +31,8 @@ class EvaluateConfig(EvalPipelineConfig):
     eval: EvaluateEvalConfig = field(default_factory=EvaluateEvalConfig)
     # Chains of the benchmark to play: the same as --eval.n_episodes. All of them: 1000.
     chains: int | None = None
-    # Processes, each with a copy of the policy; by default one per CPU core. Under Slurm, jobs.
+    # Processes, each with a copy of the policy; by default one per CPU core, and one alone if the policy is on a GPU.
+    # Under Slurm, jobs.
     workers: int | None = None
     # Where they run: local (processes), slurm or ray (pip install 'lerobot_policy_lansar[ray]').
     executor: str = "local"
@@ -41,9 +42,12 @@ class EvaluateConfig(EvalPipelineConfig):
     videos: int = 10
 
     def __post_init__(self) -> None:
+        if self.output_dir is None:
+            raise CommandError("give --output_dir: an interrupted evaluation goes on in it")
         super().__post_init__()
         if self.workers is None:
-            self.workers = len(os.sched_getaffinity(0))
+            on_cpu = self.policy is None or self.policy.device in (None, "cpu")
+            self.workers = len(os.sched_getaffinity(0)) if on_cpu else 1
         if self.chains is not None:
             self.eval.n_episodes = self.chains
 

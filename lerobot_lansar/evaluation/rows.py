@@ -8,7 +8,11 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor, nn
 
+from ..command import CommandError
 from .stream import EpisodeStream
+
+LEAST_ROWS = 4
+"""LanSAR's actions do not depend on the size of its batch, not even in rounding, from so many rows on."""
 
 
 class ResetAtCommands(nn.Module):
@@ -25,26 +29,33 @@ class ResetAtCommands(nn.Module):
 
     def __init__(self, policy: PreTrainedPolicy, streams: Sequence[EpisodeStream]):
         super().__init__()
+        policy.reset()
         self._policy, self._streams = policy, streams
         self._begun = [0] * len(streams)
         self._in_batch = hasattr(policy, "reset_environments")
         self._copies = [] if self._in_batch else [_Copy(policy) for _ in streams]
 
     def reset(self) -> None:
-        """Called by `rollout` before the first step, when nothing has been played yet."""
-        self._policy.reset()
+        """Called by `rollout` at its beginning, which is not that of an episode: nothing is forgotten."""
 
     def select_action(self, batch: dict[str, Any]) -> Tensor:
-        """(B, 7) actions; see the policy's own."""
+        """(B, 7) actions; see the policy's own.
+
+        Raises:
+            CommandError: The policy needs a copy for each environment, but its batch cannot be divided.
+        """
+        environments = len(self._streams)
         new = [i for i, stream in enumerate(self._streams) if stream.commands != self._begun[i]]
         self._begun = [stream.commands for stream in self._streams]
         if self._in_batch:
-            self._policy.reset_environments(new)  # type: ignore[operator]
-            return self._policy.select_action(batch)
+            # Fewer rows would round otherwise: the first one fills up.
+            rows = [*range(environments), *[0] * (LEAST_ROWS - environments)]
+            self._policy.reset_environments(k for k, i in enumerate(rows) if i in new)  # type: ignore[operator]
+            return self._policy.select_action(_rows(batch, rows, environments))[:environments]
         for i in new:
             self._copies[i].begin(self._streams[i])
-        rows = [each.select_action(_row(batch, i, len(self._streams))) for i, each in enumerate(self._copies)]
-        return torch.cat(rows)
+        actions = [each.select_action(_rows(batch, [i], environments)) for i, each in enumerate(self._copies)]
+        return torch.cat(actions)
 
 
 class _Copy:
@@ -87,13 +98,21 @@ class _Copy:
         return [torch.get_rng_state(), *(torch.cuda.get_rng_state(device) for device in self._devices)]
 
 
-def _row(batch: dict[str, Any], i: int, rows: int) -> dict[str, Any]:
-    """One environment's part of a batch."""
-    return {
-        key: value[i : i + 1] if isinstance(value, Tensor | list) and _length(value) == rows else value
-        for key, value in batch.items()
-    }
-
-
-def _length(value: Tensor | list) -> int:
-    return 0 if isinstance(value, Tensor) and value.ndim == 0 else len(value)
+def _rows(batch: dict[str, Any], rows: list[int], environments: int) -> dict[str, Any]:
+    """Some environments' part of a batch."""
+    if rows == list(range(environments)):
+        return batch
+    chosen: dict[str, Any] = {}
+    for key, value in batch.items():
+        if isinstance(value, Tensor) and value.ndim:
+            if len(value) != environments:
+                raise CommandError(
+                    f"the policy's {key} is {tuple(value.shape)} for {environments} environments and cannot be divided "
+                    "among them: give --eval.batch_size=1"
+                )
+            chosen[key] = value[rows]
+        elif isinstance(value, list) and len(value) == environments:
+            chosen[key] = [value[row] for row in rows]
+        else:
+            chosen[key] = value
+    return chosen

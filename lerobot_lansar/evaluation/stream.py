@@ -13,6 +13,9 @@ from ..calvin import CONTROL_HZ
 from ..envs import CalvinEnv
 from ..envs.episodes import append_episode
 
+STEPS = 300
+"""Steps of one call of `rollout`."""
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -33,13 +36,13 @@ class EpisodeStream(gym.Wrapper):
     """Plays episodes until there is none left, to LeRobot's `rollout` as one long episode.
 
     LeRobot plays a batch of episodes at a time and waits for the longest one, which takes about twice as many steps as
-    the mean. Here an environment begins the next episode at once.
+    the mean. Here an environment begins the next episode at once. `rollout` is called again and again for `STEPS`
+    steps each, since its bookkeeping looks at all steps so far in every step; a reset goes on with what is under way.
 
     Args:
         env: Without `results_dir`.
         episodes: Shared by all environments of the batch: each takes the next one. There is at least one for each.
         results_dir: Each episode gets a line in `episodes.jsonl` there, when its video is written.
-        longest: Steps after which `rollout` may stop: more than all episodes can take.
         render_fps: About how many pictures per second a video has.
 
     Attributes:
@@ -47,34 +50,45 @@ class EpisodeStream(gym.Wrapper):
         commands: How many commands have begun, in all episodes.
     """
 
-    def __init__(self, env: CalvinEnv, episodes: Iterator[Episode], results_dir: Path, longest: int, render_fps: int):
+    def __init__(self, env: CalvinEnv, episodes: Iterator[Episode], results_dir: Path, render_fps: int):
         super().__init__(env)
         self.episode: Episode | None = None
         self.commands = 0
         self._episodes, self._results_dir = episodes, results_dir
-        self._max_episode_steps = longest
+        self._max_episode_steps = STEPS  # LeRobot asks for it by this name
+        self._current: tuple[Any, dict[str, Any]] | None = None  # observation and info
         self._film_every = max(1, round(CONTROL_HZ / render_fps))
         self._frames: list[np.ndarray] = []
         self._steps = 0
 
+    @property
+    def is_over(self) -> bool:
+        """Whether all episodes that this environment took are played, and there was no other."""
+        return self._current is not None and self.episode is None
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins the first episode; `seed` is ignored, since each episode has its own."""
-        started = self._begin()
-        assert started is not None, "there are no more environments than episodes"
-        return started
+        """Begins the first episode, or goes on with the one under way; `seed` is ignored: each episode has its own."""
+        if self._current is None:
+            self._current = self._begin()
+        assert self._current is not None, "there are no more environments than episodes"
+        return self._current
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step. Where an episode ends, the observation is already the first one of the next."""
+        assert self._current is not None
+        if self.episode is None:
+            observation, info = self._current
+            return observation, 0.0, True, False, info
         observation, reward, terminated, _, info = self.env.step(action)
         self._film()
-        if not terminated:
+        self._current = observation, info
+        if terminated:
+            self._save()
+            self._current = self._begin() or self._current
+        else:
             self.commands += int(float(reward))
-            return observation, float(reward), False, False, info
-        self._save()
-        started = self._begin()
-        if started is None:
-            return observation, float(reward), True, False, info
-        return started[0], float(reward), False, False, started[1]
+        observation, info = self._current
+        return observation, float(reward), self.episode is None, False, info
 
     def _begin(self) -> tuple[Any, dict[str, Any]] | None:
         """The next episode's first observation and info; None if there is no episode left."""

@@ -11,7 +11,6 @@ from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 
-from ..calvin import CHAIN_LENGTH
 from ..envs import CalvinEnv
 from ..envs.vector import SerialVectorEnv
 from ..report.episodes import read_lines
@@ -50,21 +49,24 @@ def _evaluate(config: EvaluateConfig, env_options: dict, episodes: list[Episode]
     register_third_party_plugins()
     logging.getLogger().setLevel(logging.WARNING)
     device = get_safe_torch_device(str(config.policy.device))
-    torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) // config.workers))
+    if config.executor == "local":
+        threads = max(1, len(os.sched_getaffinity(0)) // config.workers)
+        torch.set_num_threads(min(torch.get_num_threads(), threads))
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
     set_seed(config.seed)
     policy, processors = load_policy(config.policy, config.desk, config.rename_map)
-    longest = len(episodes) * CHAIN_LENGTH * config.desk.steps_per_command + 1
     queue = iter(episodes)
     streams = [
-        EpisodeStream(CalvinEnv(**env_options), queue, config.folder, longest, config.desk.render_fps)
+        EpisodeStream(CalvinEnv(**env_options), queue, config.folder, config.desk.render_fps)
         for _ in range(min(config.eval.batch_size, len(episodes)))
     ]
     env = SerialVectorEnv([lambda stream=stream: stream for stream in streams])  # type: ignore[misc]
     precision = torch.autocast(device.type) if config.policy.use_amp else nullcontext()
     try:
         with torch.no_grad(), precision:
-            rollout(env, ResetAtCommands(policy, streams), *processors)  # type: ignore[arg-type]
+            resetting = ResetAtCommands(policy, streams)
+            while not all(stream.is_over for stream in streams):
+                rollout(env, resetting, *processors)  # type: ignore[arg-type]
     finally:
         env.close()

@@ -24,7 +24,7 @@ class KeyValueCache:
 
     Attributes:
         entries: (layers, 2: self and cross, 2: keys and values, environments, heads, tokens, head_size).
-        steps: How many steps each environment holds; set one to 0 to clear that environment.
+        steps: How many steps each environment holds; set one to 0 to decode its whole window again.
     """
 
     def __init__(
@@ -34,6 +34,11 @@ class KeyValueCache:
         self.window, self.prepended = window, prepended
         self.entries = like.new_zeros(layers, 2, 2, environments, heads, tokens, head_size)
         self.steps = [0] * environments
+
+    def clear(self, environment: int) -> None:
+        """Forgets all steps of an environment, also what was not finite: masked keys and values still take part."""
+        self.steps[environment] = 0
+        self.entries[:, :, :, environment] = 0
 
     def add(self, environments: list[int], steps: int) -> "CacheView":
         """Makes room for the next `steps` steps of each of `environments`, which are then decoded at once.

@@ -10,7 +10,7 @@ LOSSES_FILE = "losses.json"
 """In a checkpoint's `pretrained_model`: a list of {"update": int, "training": float} and {…, "held_out": float}."""
 
 EVERY = 20
-"""Updates whose training losses are averaged to one entry."""
+"""Training batches whose losses are averaged to one entry; a checkpoint ends an entry early."""
 
 
 class Losses:

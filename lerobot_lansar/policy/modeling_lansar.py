@@ -107,7 +107,7 @@ class LanSARPolicy(PreTrainedPolicy):
             )
             set_current(windows)
             self._losses = Losses()
-            if parser.parse_arg("resume") == "true":
+            if (parser.parse_arg("resume") or "").lower() == "true":
                 self._losses.load(Path(str(config.pretrained_path)))
         self.reset()
 
@@ -266,7 +266,7 @@ class LanSARPolicy(PreTrainedPolicy):
 
     def _clear(self, i: int, command: str) -> None:
         self._histories[i] = self._empty_history(command)
-        self._cache.steps[i] = 0
+        self._cache.clear(i)
 
     def _empty_history(self, command: str) -> History:
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
