@@ -128,11 +128,12 @@ def of_table(rows: list[dict[str, Any]], published: bool) -> list[str]:
         published: Whether published rows are printed beside.
     """
     notes = []
-    foreign = [row["label"] for row in rows if row["settings"]["assets"] != "original"]
+    foreign = [row for row in rows if row["settings"]["assets"] != "original"]
     if published and foreign:
+        known = all(row["settings"]["assets"] == "built-in" for row in foreign)
         notes.append(
             "Not comparable: published rows were measured on CALVIN's original assets, but "
-            f"{'; '.join(foreign)} on the built-in desk or an unknown one."
+            f"{'; '.join(row['label'] for row in foreign)} on {'the built-in desk' if known else 'another desk'}."
         )
     privileged = [row["label"] for row in rows if row["policy_reads_scene_state"]]
     if privileged and (published or len(rows) > 1):
