@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name
-from dataset_convert.layout import MANIFEST
 from dataset_convert.poses import GRIPPER_POSE
 from lerobot_lansar.calvin import CAMERAS, COLORS
+from lerobot_lansar.datasets import MANIFEST
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"

@@ -15,11 +15,11 @@ from dataset_convert.calvin import CalvinSplit
 from dataset_convert.embed import SourcePictures, embed, load_clip
 from dataset_convert.episodes import as_ranges
 from dataset_convert.hub import push
-from dataset_convert.layout import MANIFEST
 from dataset_convert.options import ConvertConfig
 from dataset_convert.plan import EXCLUDE_SHARED, make_plan, warn
 from dataset_convert.shards import DATASET, SHARDS, Job, convert_shard, frames_done, staging_of
 from lerobot_lansar.command import CommandError, run_command
+from lerobot_lansar.datasets import MANIFEST
 from lerobot_lansar.jobs.executors import run_shards
 from lerobot_lansar.jobs.staging import publish, staging
 

@@ -17,11 +17,11 @@ from tqdm import tqdm
 
 from dataset_convert import card
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.hub import find_dataset
-from dataset_convert.layout import MANIFEST, check_format
+from dataset_convert.layout import check_format
 from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.store import IMAGE_FEATURES, EmbeddingWriter, clip_dir, dataset_fingerprint
 from lerobot_lansar.command import run_command
+from lerobot_lansar.datasets import MANIFEST, find_dataset
 from lerobot_lansar.pictures import resize
 
 if TYPE_CHECKING:

@@ -12,10 +12,11 @@ import pyarrow.parquet as pq
 
 from dataset_convert import features
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, read_embeddings, write_embeddings
-from dataset_convert.layout import MANIFEST, RGBEncoder
+from dataset_convert.layout import RGBEncoder
 from dataset_convert.shards import Job, describe
 from dataset_convert.stats import Stats
 from lerobot_lansar.clip.store import sha256
+from lerobot_lansar.datasets import MANIFEST
 
 _EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 

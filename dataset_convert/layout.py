@@ -10,9 +10,6 @@ import pyarrow as pa
 from lerobot_lansar.calvin import CAMERAS
 from lerobot_lansar.pictures import resize
 
-MANIFEST = "meta/calvin_source.json"
-"""The file, relative to the dataset's folder, that says what a dataset was made from and how."""
-
 FORMAT = 2
 """Of what is written, in the manifest. 1 had CALVIN's own angles in states, which jump."""
 

@@ -7,11 +7,11 @@ from typing import Any
 from dataset_convert.blocks import BLOCK_ORDERS
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import DEDUP, MODES
-from dataset_convert.hub import folder_of
 from dataset_convert.language import LANG_FOLDER
 from dataset_convert.layout import FORMAT, RGBEncoder
 from lerobot_lansar.calvin import CONTROL_MODES
 from lerobot_lansar.clip.config import ClipConfig
+from lerobot_lansar.datasets import dataset_folder
 from lerobot_lansar.jobs.executors import check_executor
 from lerobot_lansar.jobs.work import SlurmConfig
 from lerobot_lansar.pictures import check_size
@@ -86,7 +86,7 @@ class ConvertConfig:
     @property
     def target(self) -> Path:
         """The folder to create."""
-        return folder_of(self.repo_id, self.output_dir)
+        return dataset_folder(self.repo_id, self.output_dir)
 
     def check(self) -> None:
         """Raises ValueError at an impossible option."""

@@ -12,12 +12,11 @@ import numpy as np
 from tqdm import tqdm
 
 from dataset_convert.episodes import as_ranges
-from dataset_convert.hub import find_dataset
-from dataset_convert.layout import MANIFEST
 from dataset_convert.verify_cameras import check_cameras
 from dataset_convert.verify_claims import Dataset, Mismatch, check_claims
 from dataset_convert.verify_frames import Found, verify_file
 from lerobot_lansar.command import run_command
+from lerobot_lansar.datasets import MANIFEST, find_dataset
 from lerobot_lansar.jobs.pool import in_processes
 
 

@@ -16,6 +16,7 @@ FLOORS = [
         "lerobot_lansar.pictures",
         "lerobot_lansar.benchmark",
         "lerobot_lansar.command",
+        "lerobot_lansar.datasets",
         "lerobot_lansar.jobs",
         "lerobot_lansar.paths",
     ),

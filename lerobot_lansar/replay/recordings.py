@@ -13,8 +13,7 @@ import pyarrow.parquet as pq
 from dataset_convert.blocks import block_order, block_votes, reorder_blocks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.frames import VECTORS
-from dataset_convert.hub import find_dataset
-from dataset_convert.layout import MANIFEST
+from lerobot_lansar.datasets import MANIFEST, find_dataset
 
 from ..calvin import ACTION_NAMES, CAMERAS, SCENE_NAMES, TASKS
 from ..command import CommandError

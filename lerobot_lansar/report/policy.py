@@ -1,15 +1,12 @@
 """What the files beside a policy say: its inputs, and the look of the pictures that it was trained on."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from ..command import CommandError
+from ..datasets import MANIFEST, dataset_folder
 from .published import GRIPPER, ROBOT, SCENE, STATIC
-
-MANIFEST = "meta/calvin_source.json"
-"""The file in which `lansar-convert` says where a dataset's pictures come from."""
 
 LOOK = ("renderer", "assets", "image_size")
 """What decides how the desk looks in a policy's pictures; entries of an episode's line and of a manifest's `look`."""
@@ -83,9 +80,8 @@ class Policy:
 
     def _manifest(self, dataset: dict[str, Any]) -> Path:
         """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
-        cache = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "lerobot"
-        root = dataset.get("root") or Path(os.environ.get("HF_LEROBOT_HOME", cache)) / dataset["repo_id"]
-        file = Path(root).expanduser() / MANIFEST
+        root = dataset.get("root")
+        file = dataset_folder(dataset["repo_id"], None if root is None else Path(root)) / MANIFEST
         return file if file.is_file() else self._fetch(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
 
     def _file(self, path: str, name: str) -> Path:

@@ -14,9 +14,9 @@ from fake_calvin import write_calvin
 from hub_server import TOKEN, Hub
 
 from dataset_convert import convert
-from dataset_convert.hub import find_dataset
 from dataset_convert.options import ConvertConfig
 from lerobot_lansar.clip.config import ClipConfig
+from lerobot_lansar.datasets import find_dataset
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -1,0 +1,52 @@
+"""Where LeRobot keeps datasets, and the file in which a converted one says where it comes from."""
+
+import os
+from pathlib import Path
+
+from huggingface_hub.constants import HF_HOME
+
+MANIFEST = "meta/calvin_source.json"
+"""File in which `lansar-convert` says what a dataset was made from."""
+
+VERSION = "v3.0"
+"""LeRobot's tag of the dataset format: the revision that it asks the hub for."""
+
+
+def dataset_folder(repo_id: str, folder: Path | None) -> Path:
+    """A dataset's folder: the one given, or where LeRobot makes one of that name, `$HF_LEROBOT_HOME/<repo_id>`."""
+    if folder is not None:
+        return folder
+    return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser() / repo_id
+
+
+def find_dataset(repo_id: str, folder: Path | None) -> Path:
+    """A dataset's folder: the one given, or where LeRobot 0.6 finds that name without asking the hub.
+
+    That is `$HF_LEROBOT_HOME/<repo_id>`, unless it lacks the dataset or is a download by an earlier LeRobot; then
+    the snapshot of `VERSION` in the download cache `$HF_LEROBOT_HOME/hub`.
+
+    Args:
+        repo_id: user/name.
+        folder: Given by the user; returned unchecked.
+
+    Raises:
+        FileNotFoundError: No folder is given and there is neither.
+    """
+    if folder is not None:
+        return folder
+    from huggingface_hub import snapshot_download  # late: reports and workers need the name of a file only
+    from huggingface_hub.errors import LocalEntryNotFoundError
+
+    own, cache = dataset_folder(repo_id, None), dataset_folder("hub", None)
+    if (own / "meta/info.json").is_file() and not (own / ".cache/huggingface/download").exists():
+        return own
+    try:
+        return Path(
+            snapshot_download(repo_id, repo_type="dataset", revision=VERSION, cache_dir=cache, local_files_only=True)
+        )
+    except (LocalEntryNotFoundError, ValueError) as error:  # no such download; not a name that the hub allows
+        raise FileNotFoundError(
+            f"no dataset {repo_id} in {own}, nor among LeRobot's downloads in {cache}: give its folder as "
+            f"--dataset_dir, or download it: hf download {repo_id} --repo-type=dataset --revision={VERSION} "
+            f"--cache-dir={cache}"
+        ) from error
