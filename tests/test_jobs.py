@@ -91,7 +91,10 @@ def leave_note(folder, shard):
     (folder / f"{shard}").touch()
 
 
-def misbehave(folder, how, shard):
+LARGE = b"x" * 1_000_000  # a worker must read it before the next one is started
+
+
+def misbehave(folder, how, _, shard):
     """Shard 0 leaves its process id and works for ever; shard 1 ends its process, or raises, at once or once told."""
     note = folder / "process"
     if shard == 0:
@@ -146,10 +149,10 @@ def test_local_work_runs_all_shards_before_the_finishing_step(workers, tmp_path)
     ("how", "error", "message"),
     [("dies", WorkerDied, "a worker process was killed"), ("raises", ValueError, "shard 1 failed")],
 )
-@pytest.mark.parametrize("main_thread", [True, False])
-def test_a_worker_that_dies_or_fails_ends_the_others(how, error, message, main_thread, tmp_path):
-    """Also when the work was begun from another thread than the main one."""
-    arguments = (misbehave, (tmp_path, how)), (leave_note, (tmp_path,))
+@pytest.mark.parametrize(("main_thread", "shards"), [(True, 4), (False, 4), (True, 2)])
+def test_a_worker_that_dies_or_fails_ends_the_others(how, error, message, main_thread, shards, tmp_path):
+    """Also when the work was begun from another thread than the main one, and when no shard is waiting."""
+    arguments = (misbehave, (tmp_path, how, LARGE)), (leave_note, (tmp_path,)), 2, shards
     with ThreadPoolExecutor(1) as thread, pytest.raises(error, match=message):
         run_here(*arguments) if main_thread else thread.submit(run_here, *arguments).result()
     assert not (tmp_path / "0").exists(), "the finishing step must not run"
@@ -159,7 +162,7 @@ def test_a_worker_that_dies_or_fails_ends_the_others(how, error, message, main_t
 def test_a_worker_that_fails_leaves_processes_of_other_threads_alone(tmp_path):
     other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
     with ThreadPoolExecutor(1) as thread:
-        work = thread.submit(run_here, (misbehave, (tmp_path, "raises when told")), (leave_note, (tmp_path,)))
+        work = thread.submit(run_here, (misbehave, (tmp_path, "raises when told", LARGE)), (leave_note, (tmp_path,)))
         while not (tmp_path / "process").exists():
             time.sleep(0.01)
         other.start()

@@ -40,6 +40,9 @@ def in_processes[Item, Result](
     try:
         with _blocked_interrupts():  # the workers start here
             futures = [pool.submit(_call, item) for item in items]
+            # Each submission may start a worker, but only the next one makes the pool watch it: without this one, the
+            # death of the last worker would go unnoticed until another one is done.
+            pool.submit(int)
         for future in futures if ordered else as_completed(futures):
             yield future.result()
     except BaseException as error:  # end the other workers too, whatever they are doing
