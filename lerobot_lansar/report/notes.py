@@ -84,6 +84,10 @@ def _episodes(row: dict[str, Any], chains_known: bool) -> list[str]:
     several = [key for key, value in row["settings"].items() if isinstance(value, list)]
     if several:
         notes.append(f"Its episodes were not all run alike: see {', '.join(several)}.")
+    if row["missing"] and row["kind"] != "single tasks":
+        notes.append(
+            "Not finished: chains that fail soon are over before those that go on, so the average length will rise."
+        )
     early = row["ended_early"]
     if early:
         notes.append(
