@@ -1,6 +1,5 @@
 """Demonstrations of all 34 tasks: they succeed, keep CALVIN's relations, can be replayed, and move like a hand."""
 
-import multiprocessing
 import os
 from functools import partial
 
@@ -13,6 +12,7 @@ from lerobot_lansar.demos.motion import TOP_SPEED, Disturbance
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, Desk, DeskError, SimulationError, is_fulfilled
 from lerobot_lansar.desk.starts import sample_start
+from lerobot_lansar.jobs.pool import in_processes
 
 STARTS, NEEDED = 30, 27
 
@@ -42,8 +42,8 @@ def successes(job):
 
 
 def rates(scene, assets=None):
-    with multiprocessing.get_context("spawn").Pool(os.cpu_count()) as pool:
-        return dict(zip(TASKS, pool.map(successes, [(scene, assets, t) for t in TASKS], 1), strict=True))
+    jobs = [(scene, assets, task) for task in TASKS]
+    return dict(zip(TASKS, in_processes(successes, jobs, os.cpu_count(), ordered=True), strict=True))
 
 
 @pytest.mark.slow
