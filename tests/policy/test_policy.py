@@ -265,7 +265,7 @@ def test_impossible_options_are_refused_with_the_option_named():
             small_config(**{option: value})
     with pytest.raises(ValueError, match=r"--policy.use_spatial_context=false"):
         small_config(use_images=False, use_spatial_context=False)
-    with pytest.raises(ValueError, match=r"--policy.clip.model='nope'"):
+    with pytest.raises(ValueError, match=r"clip.model='nope'"):
         LanSARPolicy(small_config(clip=ClipConfig("nope", "")))
 
 

@@ -193,7 +193,7 @@ def training_config(name):
 TRAINING = [
     str(file.relative_to(CONFIGS).with_suffix(""))
     for file in sorted(CONFIGS.rglob("*.yaml"))
-    if not file.name.startswith(("eval", "sentences"))
+    if not file.name.startswith(("eval", "sentences", "tables"))
 ]
 
 
