@@ -80,7 +80,7 @@ def _evaluate(config: EvaluateConfig) -> Path:
     (folder / INFO_FILE).unlink(missing_ok=True)  # of an evaluation with fewer episodes
     config.workers = min(config.workers or 1, max(1, len(missing)))
     executor = config.executor if missing else "local"
-    started = time.time() - seconds
+    started, tally = time.time() - seconds, _Tally(config)
     try:
         with submitted_jobs(folder / _STATE, submitting=executor == "slurm"):
             complete = run_shards(
@@ -91,11 +91,11 @@ def _evaluate(config: EvaluateConfig) -> Path:
                 workers=config.workers,
                 slurm=config.slurm,
                 logging_dir=folder / _STATE / "jobs",
-                progress=lambda: len(_counted(config)),
+                progress=lambda: len(tally()),
                 total=len(episodes),
                 unit="chain" if list(desk.suites()) == [LH_MTLC] else "episode",
                 desc="evaluating",
-                status=lambda: _mean(_counted(config), desk.suites()),
+                status=lambda: _mean(tally(), desk.suites()),
             )
     finally:
         if executor != "slurm":
@@ -133,6 +133,21 @@ def _counted(config: EvaluateConfig) -> list[Played]:
     """The planned episodes that have a line; an earlier run may have played more."""
     wanted = {(episode.task, episode.seed) for episode in planned(config)}
     return [episode for episode in read_lines(config.folder) if episode.key in wanted]
+
+
+class _Tally:
+    """What `_counted` returns, read again only when the file has grown: the progress bar asks twice a second."""
+
+    def __init__(self, config: EvaluateConfig) -> None:
+        self._config, self._size = config, -1
+        self._episodes: list[Played] = []
+
+    def __call__(self) -> list[Played]:
+        file = self._config.folder / EPISODES_FILE
+        size = file.stat().st_size if file.exists() else 0
+        if size != self._size:
+            self._size, self._episodes = size, _counted(self._config)
+        return self._episodes
 
 
 def _mean(episodes: list[Played], suites: dict[str, tuple[str, ...]]) -> str:

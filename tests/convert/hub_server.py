@@ -24,6 +24,36 @@ LARGE = re.compile(r"\.(parquet|mp4|npy|safetensors|arrow)$")
 """Files that the hub stores in LFS whatever their size."""
 
 
+_LAUNCH = """
+import os, sys
+import httpx
+import huggingface_hub
+
+class Loopback(httpx.HTTPTransport):
+    def handle_request(self, request):
+        here = httpx.URL(os.environ["HF_ENDPOINT"])
+        request.url = request.url.copy_with(scheme=here.scheme, host=here.host, port=here.port)
+        request.headers["Host"] = here.netloc.decode()
+        request.headers["Authorization"] = "Bearer " + os.environ["HF_TOKEN"]
+        return super().handle_request(request)
+
+huggingface_hub.set_client_factory(
+    lambda: httpx.Client(mounts={"https://huggingface.co": Loopback()}, follow_redirects=True, timeout=60)
+)
+from MODULE import main
+sys.exit(main())
+"""
+
+
+def launcher(module: str) -> str:
+    """Python that runs a command's `main` with all of the hub's addresses led to the loopback.
+
+    The client has one of them in its code: huggingface_hub 1.x has cards checked at https://huggingface.co whatever
+    HF_ENDPOINT says.
+    """
+    return _LAUNCH.replace("MODULE", module)
+
+
 @dataclass
 class Repository:
     """Commits (newest last) with their files: path -> (blob's SHA-1, size, LFS SHA-256 or None)."""

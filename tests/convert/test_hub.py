@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_calvin import write_calvin
-from hub_server import TOKEN, Hub
+from hub_server import TOKEN, Hub, launcher
 
 from dataset_convert import convert
 from dataset_convert.options import ConvertConfig
@@ -20,27 +20,7 @@ from lerobot_lansar.datasets import find_dataset
 
 REPOSITORY = Path(__file__).parents[2]
 
-LAUNCH = """
-import os, sys
-import httpx
-import huggingface_hub
-
-class Loopback(httpx.HTTPTransport):
-    def handle_request(self, request):
-        here = httpx.URL(os.environ["HF_ENDPOINT"])
-        request.url = request.url.copy_with(scheme=here.scheme, host=here.host, port=here.port)
-        request.headers["Host"] = here.netloc.decode()
-        request.headers["Authorization"] = "Bearer " + os.environ["HF_TOKEN"]
-        return super().handle_request(request)
-
-huggingface_hub.set_client_factory(
-    lambda: httpx.Client(mounts={"https://huggingface.co": Loopback()}, follow_redirects=True, timeout=60)
-)
-from dataset_convert.convert import main
-sys.exit(main())
-"""
-"""`lansar-convert` with the one address that the hub's client has written into its code, that of the card's check
-(huggingface_hub 1.x asks https://huggingface.co whatever HF_ENDPOINT says), led to the loopback too."""
+LAUNCH = launcher("dataset_convert.convert")
 
 
 @pytest.fixture

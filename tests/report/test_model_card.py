@@ -13,28 +13,9 @@ from lerobot_lansar.report.hub import merge_index, model_index
 from lerobot_lansar.report.report import ReportConfig, report
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "convert"))
-from hub_server import TOKEN, Hub, Repository
+from hub_server import TOKEN, Hub, Repository, launcher
 
-LAUNCH = """
-import os, sys
-import httpx
-import huggingface_hub
-
-class Loopback(httpx.HTTPTransport):
-    def handle_request(self, request):
-        here = httpx.URL(os.environ["HF_ENDPOINT"])
-        request.url = request.url.copy_with(scheme=here.scheme, host=here.host, port=here.port)
-        request.headers["Host"] = here.netloc.decode()
-        request.headers["Authorization"] = "Bearer " + os.environ["HF_TOKEN"]
-        return super().handle_request(request)
-
-huggingface_hub.set_client_factory(
-    lambda: httpx.Client(mounts={"https://huggingface.co": Loopback()}, follow_redirects=True, timeout=60)
-)
-from lerobot_lansar.report.report import main
-sys.exit(main())
-"""
-"""`lansar-report`, with the address of the card's check, which the client has in its code, led to loopback."""
+LAUNCH = launcher("lerobot_lansar.report.report")
 
 CARD = """---
 license: apache-2.0
