@@ -96,8 +96,11 @@ def trained_depth_unit() -> str:
 
 
 def evaluated_policy() -> str | None:
-    """`--policy.path` of the command: a name on the hub, or the folder that it leads to; None without one."""
-    policy = parser.get_path_arg("policy")
+    """`--policy.path` of the command: a name on the hub, or the folder that it leads to; None without one.
+
+    None in a training too, which evaluates what it has made of that policy so far.
+    """
+    policy = None if parser.parse_arg("dataset.repo_id") is not None else parser.get_path_arg("policy")
     if policy is None or not Path(policy).is_dir():
         return policy
     folder = Path(policy).resolve()  # `checkpoints/last` is another folder tomorrow

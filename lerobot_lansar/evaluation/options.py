@@ -23,6 +23,11 @@ class EvaluateEvalConfig(EvalConfig):
     # Not used: --workers divides the environments among processes.
     use_async_envs: bool = False
 
+    def __post_init__(self) -> None:
+        wanted = self.batch_size
+        super().__post_init__()  # lowers it to --eval.n_episodes, which --chains may still raise
+        self.batch_size = wanted or self.batch_size
+
 
 @dataclass
 class EvaluateConfig(EvalPipelineConfig):

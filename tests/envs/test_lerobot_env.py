@@ -218,3 +218,19 @@ def test_sync_and_async_agree_and_finished_episodes_freeze(tmp_path):
     for folder in ("sync", "async"):
         lines = [json.loads(line) for line in (tmp_path / folder / "episodes.jsonl").read_text().splitlines()]
         assert sorted(line["seed"] for line in lines) == [3, 4]
+
+
+def test_lines_name_the_policy_that_is_evaluated_but_not_one_that_is_being_trained(tmp_path, monkeypatch):
+    folder = tmp_path / "checkpoints" / "000100"
+    folder.mkdir(parents=True)
+    (tmp_path / "checkpoints" / "last").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+
+    def named(*arguments):
+        monkeypatch.setattr(sys, "argv", ["command", *arguments])
+        return CalvinEnvConfig().gym_kwargs["results_extra"]
+
+    assert named("--policy.path=checkpoints/last") == {"policy": "checkpoints/000100", "policy_reset": "batch"}
+    assert named("--policy.path=you/model")["policy"] == "you/model"
+    assert named("--policy.path=checkpoints/last", "--dataset.repo_id=you/desk")["policy"] is None
+    assert named()["policy"] is None

@@ -135,6 +135,10 @@ def test_more_chains_are_added_to_those_that_were_played(checkpoint, undisturbed
     assert json.loads((folder / "eval_config.json").read_text())["seconds"] > seconds > 0
 
 
+def test_a_batch_may_be_larger_than_lerobots_default_number_of_episodes():
+    assert EvaluateEvalConfig(batch_size=100).batch_size == 100
+
+
 def test_eval_info_counts_what_the_lines_say(checkpoint, tmp_path):
     config = EvaluateConfig.__new__(EvaluateConfig)
     config.output_dir, config.seed, config.videos = tmp_path, 0, 2
