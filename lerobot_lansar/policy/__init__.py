@@ -9,13 +9,15 @@ processor_lansar      LeRobot pipeline steps: training windows, CLIP embeddings
 windows               which steps of which demonstration a sampled frame stands for
 frames                a dataset's frames as memory-mapped arrays
 scheduler             the learning rate over a run
+optimizer             Muon
 card                  the text of an uploaded policy's model card
 
-LeRobot rebuilds a checkpoint's pipelines and scheduler by their registered names, so processor and scheduler are
-imported here. It imports the model itself when it builds one.
+LeRobot rebuilds a checkpoint's pipelines, optimizer and scheduler by their registered names, so these are imported
+here. It imports the model itself when it builds one.
 """
 
 from .configuration_lansar import LanSARConfig
+from .optimizer import MuonConfig
 from .processor_lansar import ClipStep, WindowStep, make_lansar_pre_post_processors
 from .scheduler import LinearWarmupDecaySchedulerConfig
 
@@ -23,6 +25,7 @@ __all__ = [
     "ClipStep",
     "LanSARConfig",
     "LinearWarmupDecaySchedulerConfig",
+    "MuonConfig",
     "WindowStep",
     "make_lansar_pre_post_processors",
 ]

@@ -4,12 +4,13 @@ from dataclasses import dataclass, field
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
-from lerobot.optim import AdamWConfig
+from lerobot.optim import AdamWConfig, OptimizerConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from ..clip.config import ClipConfig
 from ..clip.model import embedding_size
 from .network import NetworkConfig
+from .optimizer import MuonConfig
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, encoded_sizes
 from .scheduler import LinearWarmupDecaySchedulerConfig
 
@@ -20,6 +21,7 @@ CHOICES = {
     "window_start": ("episode", "anywhere", "mixed"),
     "control_mode": ("abs", "rel"),
     "dtype": ("float32", "bfloat16"),
+    "optimizer": ("adamw", "muon"),
 }
 
 
@@ -90,9 +92,11 @@ class LanSARConfig(PreTrainedConfig):
 
     # Beta of the smooth L1 losses (Eq 4.3, 4.4).
     smooth_l1_beta: float = 0.1
-    # Peak learning rate of AdamW.
+    # adamw (thesis), or muon: Muon for the matrices of the hidden layers and AdamW for everything else.
+    optimizer: str = "adamw"
+    # Peak learning rate.
     learning_rate: float = 4e-4
-    # Weight decay of AdamW.
+    # Weight decay.
     weight_decay: float = 0.01
     # Share of the updates in which the learning rate rises; afterwards it falls to 0.
     warmup_fraction: float = 0.04
@@ -208,7 +212,9 @@ class LanSARConfig(PreTrainedConfig):
             for name in [k for k, f in self.input_features.items() if f.type is FeatureType.VISUAL]:
                 del self.input_features[name]
 
-    def get_optimizer_preset(self) -> AdamWConfig:
+    def get_optimizer_preset(self) -> OptimizerConfig:
+        if self.optimizer == "muon":
+            return MuonConfig(lr=self.learning_rate, weight_decay=self.weight_decay)
         return AdamWConfig(lr=self.learning_rate, weight_decay=self.weight_decay)
 
     def get_scheduler_preset(self) -> LinearWarmupDecaySchedulerConfig:

@@ -20,6 +20,7 @@ from .card import card_text
 from .configuration_lansar import LanSARConfig
 from .losses import Losses
 from .network import LanSARNetwork
+from .optimizer import parameter_groups
 from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, VALID_STEPS
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
 from .windows import Windows, set_current
@@ -134,7 +135,7 @@ class LanSARPolicy(PreTrainedPolicy):
                 )
 
     def get_optim_params(self) -> Any:
-        return list(self.parameters())
+        return parameter_groups(self) if self.config.optimizer == "muon" else list(self.parameters())
 
     def reset(self) -> None:
         """Clears all histories; LeRobot calls this before each batch of episodes."""

@@ -401,6 +401,57 @@ def test_the_training_presets_are_table_4_2s():
     assert config.observation_delta_indices is config.action_delta_indices is None
 
 
+def test_muon_updates_hidden_matrices_and_adamw_the_rest():
+    policy = make_policy(optimizer="muon", learning_rate=0.01, weight_decay=0.1)
+    config = policy.config.get_optimizer_preset()
+    names = {id(parameter): name for name, parameter in policy.named_parameters()}
+    matrices, rest = ({names[id(p)] for p in group["params"]} for group in policy.get_optim_params())
+    assert matrices | rest == set(names.values())
+    hidden = [
+        "state_context.4",
+        "motion_head.0",
+        "decoder_layers.1.cross_attention.out",
+        "context_layers.0.feedforward.3",
+    ]
+    assert {f"network.{name}.weight" for name in hidden} <= matrices
+    ends = [
+        "state_context.0.weight",
+        "motion_head.8.weight",
+        "cls.weight",
+        "memory_position.weight",
+        "motion_head.0.bias",
+    ]
+    assert {f"network.{name}" for name in ends} <= rest
+
+    def updated(build, steps, resume_after=None):
+        """The parameters after some updates with random gradients, of a new policy with an optimizer of its own."""
+        policy = make_policy(optimizer="muon")
+        optimizers = build(policy)
+        for step in range(steps):
+            generator = torch.Generator().manual_seed(step)
+            for parameter in policy.parameters():
+                parameter.grad = torch.randn(parameter.shape, generator=generator)
+            if step == resume_after:
+                state = optimizers[0].state_dict()
+                optimizers = build(policy)
+                optimizers[0].load_state_dict(state)
+            for optimizer in optimizers:
+                optimizer.step()
+        return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+
+    def torchs_own(policy):
+        first, second = ([p for n, p in policy.named_parameters() if n in part] for part in (matrices, rest))
+        muon = torch.optim.Muon(first, lr=0.01, weight_decay=0.1, adjust_lr_fn="match_rms_adamw")
+        return muon, torch.optim.AdamW(second, lr=0.01, weight_decay=0.1)
+
+    expected = updated(torchs_own, 4)
+    assert torch.equal(updated(lambda policy: [config.build(policy.get_optim_params())], 4), expected)
+    assert torch.equal(updated(lambda policy: [config.build(policy.get_optim_params())], 4, resume_after=2), expected)
+    # --optimizer.type=muon for any policy: everything with two dimensions
+    shapes = [[p.ndim for p in group["params"]] for group in config.build(policy.parameters()).param_groups]
+    assert [set(part) for part in shapes] == [{2}, {1}]
+
+
 def test_mixed_precision_changes_neither_what_is_kept_nor_what_is_decided():
     policy = make_policy()
     _, expected = step(policy, np.random.default_rng(0), ["open the drawer"])

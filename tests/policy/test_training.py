@@ -136,6 +136,7 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
         "--policy.clip.model=lansar-tiny",
         "--policy.clip.pretrained=",
         "--policy.dtype=bfloat16",
+        "--policy.optimizer=muon",
         "--dataset.repo_id=test/desk",
         f"--dataset.root={tmp_path / 'data'}",
         f"--output_dir={tmp_path / 'out'}",
@@ -172,7 +173,10 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
     weight = "network.motion_head.0.weight"
     assert not torch.equal(after[weight], before[weight])
     optimizer = load_file(checkpoints[1] / "training_state/optimizer_state.safetensors")
-    assert optimizer["state/0/step"] == 6  # resumed, not begun again
+    assert {int(value) for key, value in optimizer.items() if key.endswith("/step")} == {6}  # resumed, not begun again
+    groups = json.loads((checkpoints[1] / "training_state/optimizer_param_groups.json").read_text())
+    assert [group["name"] for group in groups] == ["matrices", "rest"]
+    assert f"state/{groups[0]['params'][0]}/momentum_buffer" in optimizer
 
 
 def test_the_units_that_fsdp_shards_are_the_networks_layers():
@@ -223,6 +227,7 @@ def test_the_thesis_preset_is_the_thesis():
         "dropout": 0.1,
         "window": 64,
         "learning_rate": 4e-4,
+        "optimizer": "adamw",
         "weight_decay": 0.01,
         "warmup_fraction": 5 / 125,
         # sections 3 and 4.2

@@ -1,0 +1,126 @@
+"""Muon as a LeRobot optimizer, `--policy.optimizer=muon` or `--optimizer.type=muon`."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from lerobot.optim import OptimizerConfig
+from torch import Tensor, nn
+from torch.optim import AdamW, Optimizer
+
+MATRICES = "matrices"
+"""Name of the parameter group that Muon updates; AdamW updates all others."""
+
+
+@OptimizerConfig.register_subclass("muon")
+@dataclass
+class MuonConfig(OptimizerConfig):
+    """Muon for matrices and AdamW for everything else, with one learning rate for both.
+
+    Muon's updates are scaled to the size of AdamW's ("match_rms_adamw" of `torch.optim.Muon`), so a learning rate means
+    about the same to both.
+    """
+
+    # Peak learning rate.
+    lr: float = 3e-3
+    # Weight decay.
+    weight_decay: float = 0.01
+    # Share of the last momentum that Muon keeps in every update.
+    momentum: float = 0.95
+    # AdamW's.
+    betas: tuple[float, float] = (0.9, 0.999)
+    # AdamW's.
+    eps: float = 1e-8
+    # Gradients are clipped to this norm.
+    grad_clip_norm: float = 10.0
+
+    def build(self, params: Any) -> "Muon":
+        """Builds the optimizer.
+
+        Args:
+            params: Parameter groups, of which Muon updates the one named `MATRICES` (see `parameter_groups`); or
+                parameters, of which Muon updates all with two dimensions.
+        """
+        groups = list(params)
+        if not groups or not isinstance(groups[0], dict):
+            matrices = [p for p in groups if p.ndim == 2]
+            groups = [
+                {"params": matrices, "name": MATRICES},
+                {"params": [p for p in groups if p.ndim != 2], "name": "rest"},
+            ]
+        options = asdict(self)
+        options.pop("grad_clip_norm")
+        return Muon([group for group in groups if group["params"]], **options)
+
+
+def parameter_groups(network: nn.Module) -> list[dict[str, Any]]:
+    """A network's parameters for `MuonConfig.build`: the matrices between hidden activations, and the rest.
+
+    Muon is made for matrices that map hidden activations to hidden activations. Embeddings, the first layer of each
+    MLP that reads an input and the last layer of each head stay with AdamW, as do norms and biases.
+    """
+    mlps = [module for module in network.modules() if type(module) is nn.Sequential]
+    ends = {id(mlp[-1] if isinstance(mlp[-1], nn.Linear) else mlp[0]) for mlp in mlps}
+    linear = [module for module in network.modules() if isinstance(module, nn.Linear)]
+    hidden = {id(layer.weight) for layer in linear if id(layer) not in ends}
+    parameters = [p for p in network.parameters() if p.requires_grad]
+    return [
+        {"params": [p for p in parameters if id(p) in hidden], "name": MATRICES},
+        {"params": [p for p in parameters if id(p) not in hidden], "name": "rest"},
+    ]
+
+
+class Muon(Optimizer):
+    """`torch.optim.Muon` and `torch.optim.AdamW` behind the interface of one optimizer, which LeRobot needs.
+
+    Args:
+        groups: Parameter groups; the one named `MATRICES` holds parameters with two dimensions.
+        lr, weight_decay: Of both.
+        momentum: Muon's.
+        betas, eps: AdamW's.
+    """
+
+    def __init__(
+        self,
+        groups: list[dict[str, Any]],
+        lr: float,
+        weight_decay: float,
+        momentum: float,
+        betas: tuple[float, float],
+        eps: float,
+    ) -> None:
+        matrices = [group for group in groups if group.get("name") == MATRICES]
+        rest = [group for group in groups if group.get("name") != MATRICES]
+        self._parts: list[Optimizer] = []
+        if matrices:
+            muon = torch.optim.Muon(
+                matrices, lr=lr, weight_decay=weight_decay, momentum=momentum, adjust_lr_fn="match_rms_adamw"
+            )
+            self._parts.append(muon)
+        if rest:
+            self._parts.append(AdamW(rest, lr=lr, weight_decay=weight_decay, betas=betas, eps=eps))
+        super().__init__([group for part in self._parts for group in part.param_groups], {})
+        self._share()
+
+    def _share(self) -> None:
+        """Makes the parts work on this optimizer's groups and state, which schedulers and checkpoints know."""
+        start = 0
+        for part in self._parts:
+            end = start + len(part.param_groups)
+            part.param_groups, part.state = self.param_groups[start:end], self.state
+            start = end
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Tensor | None:  # type: ignore[override]
+        """One update of all parameters."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for part in self._parts:
+            part.step()
+        return loss
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self._share()
