@@ -72,6 +72,9 @@ class LanSARConfig(PreTrainedConfig):
     # Block positions are also given relative to the TCP, with finer resolution near it, so that the network need not
     # learn to subtract positions.
     egocentric_blocks: bool = True
+    # Blocks and furniture are also given as what has changed since the command began, which no window may reach back
+    # to. Needs demonstrations that are whole subtasks (lansar-record --mode=chains or windows), each from its command.
+    since_command: bool = False
     # What the motion head learns to predict: commanded (recorded action minus current pose) or achieved (next pose
     # minus current pose, thesis).
     target: str = "commanded"
@@ -162,10 +165,13 @@ class LanSARConfig(PreTrainedConfig):
                 "keep one of them."
             )
 
+        if self.since_command and not self.use_spatial_context:
+            raise ValueError("--policy.since_command=true needs --policy.use_spatial_context=true, which it extends.")
+
     @property
     def network(self) -> NetworkConfig:
         """What the network needs of these options."""
-        state, block, scene = encoded_sizes(self.orientation, self.egocentric_blocks)
+        state, block, scene = encoded_sizes(self.orientation, self.egocentric_blocks, self.since_command)
         return NetworkConfig(
             state_dim=state,
             block_dim=block,

@@ -21,7 +21,7 @@ from .configuration_lansar import LanSARConfig
 from .losses import Losses
 from .network import LanSARNetwork
 from .optimizer import parameter_groups
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, VALID_STEPS
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, START, VALID_STEPS
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
 from .windows import Windows, set_current
 
@@ -32,6 +32,7 @@ class History:
 
     Attributes:
         command: The sentence being carried out.
+        start: The environment state when it began, (24,); None before the first step.
         projections: C for the memory and for the target, (1, h) each; None before the first step.
         steps: Control steps so far; the window may hold fewer.
         contexts: E of the steps in the window, (length, h), each computed once.
@@ -39,6 +40,7 @@ class History:
     """
 
     command: str
+    start: Tensor | None
     projections: tuple[Tensor, Tensor] | None
     steps: int
     contexts: Tensor
@@ -63,6 +65,7 @@ TRAINED_OPTIONS = (
     "command_prepended",
     "orientation",
     "egocentric_blocks",
+    "since_command",
     "target",
     "clip",
 )
@@ -95,16 +98,18 @@ class LanSARPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self._losses: Losses | None = None  # in training only
-        self.scaler = Scaler(config.orientation, config.egocentric_blocks)
+        self.scaler = Scaler(config.orientation, config.egocentric_blocks, config.since_command)
         self.network = LanSARNetwork(config.network)
         if dataset_meta is not None:
             self._check_pretrained()
             _drop_videos(dataset_meta.features)
             windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
+            environment_state = windows.frames["environment_state"]
             self.scaler.fit(
                 torch.tensor(windows.frames["state"]),
-                torch.tensor(windows.frames["environment_state"]),
+                torch.tensor(environment_state),
                 torch.tensor(windows.targets[windows.has_target, :6]),
+                torch.tensor(environment_state[windows.frames["first"]]) if config.since_command else None,
             )
             set_current(windows)
             self._losses = Losses()
@@ -192,7 +197,7 @@ class LanSARPolicy(PreTrainedPolicy):
         valid_steps, state = batch[VALID_STEPS], batch[OBS_STATE]
         if self.training and self.config.state_noise:
             state = self._add_noise(state)
-        inputs = self.scaler.encode(state, batch[OBS_ENV_STATE])
+        inputs = self.scaler.encode(state, batch[OBS_ENV_STATE], batch.get(START))
         pictures = (batch.get(key) for key in CLIP_IMAGE.values())
         motion, logit, contrast = self.network(
             batch[CLIP_COMMAND], *inputs, valid_steps, *pictures, batch.get(COMMAND_TASKS)
@@ -262,16 +267,18 @@ class LanSARPolicy(PreTrainedPolicy):
             self._histories = [self._empty_history("") for _ in commands]
             self._cache = self.network.new_cache(len(commands))
         for i, (history, command) in enumerate(zip(self._histories, commands, strict=True)):
-            if history.command != command or history.steps >= self.config.history_clear_steps:
+            if history.command != command:
                 self._clear(i, command)
+            elif history.steps >= self.config.history_clear_steps:
+                self._clear(i, command, history.start)
 
-    def _clear(self, i: int, command: str) -> None:
-        self._histories[i] = self._empty_history(command)
+    def _clear(self, i: int, command: str, start: Tensor | None = None) -> None:
+        self._histories[i] = self._empty_history(command, start)
         self._cache.clear(i)
 
-    def _empty_history(self, command: str) -> History:
+    def _empty_history(self, command: str, start: Tensor | None = None) -> History:
         empty = self.network.cls.weight.new_zeros(0, self.config.hidden)
-        return History(command, None, 0, empty, empty)
+        return History(command, start, None, 0, empty, empty)
 
     def _predict(
         self,
@@ -282,12 +289,19 @@ class LanSARPolicy(PreTrainedPolicy):
         gripper: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Adds one step to the histories: (B, 15), (B, 24), (B, D)... -> scaled motion (B, 6), gripper logits (B,)."""
-        x, blocks, scene = self.scaler.encode(state, environment_state)
+        x, blocks, scene = self.scaler.encode(state, environment_state, self._starts(environment_state))
         commands = self._encode_commands(command)
         modalities = self.network.encode_modalities(x, blocks, scene, static, gripper)
         contexts = self.network.encode_context(modalities, commands[0])  # (B, h)
         self._append(contexts, self.network.state_target(x))
         return self.network.predict(self._decode_newest(commands))
+
+    def _starts(self, environment_state: Tensor) -> Tensor:
+        """(B, 24) now -> the same when each environment's command began."""
+        for history, now in zip(self._histories, environment_state, strict=True):
+            if history.start is None:
+                history.start = now
+        return torch.stack([history.start for history in self._histories if history.start is not None])
 
     def _encode_commands(self, command: Tensor) -> tuple[Tensor, Tensor]:
         """(B, D) -> C for memory and target, (B, h) each, computed once per history."""

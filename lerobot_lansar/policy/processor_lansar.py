@@ -18,6 +18,7 @@ The batch then holds, in training and (without the axis n) in evaluation:
 
 and in training only:
 
+    start_environment_state        (B, 1, 24) when the command began; with `since_command`
     action                         (B, n, 7), the targets
     valid_steps                    (N,) which of the B * n steps are not padding
     command_tasks                  (B, tasks) 1 for the tasks that a command can mean; for the contrastive loss
@@ -49,6 +50,7 @@ CLIP_COMMAND = "observation.clip.command"
 CLIP_IMAGE = {"static": "observation.clip.static", "gripper": "observation.clip.gripper"}
 
 VALID_STEPS = "valid_steps"
+START = "start_environment_state"
 COMMAND_TASKS = "command_tasks"
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -91,6 +93,8 @@ class WindowStep(ProcessorStep):
             "task": self.windows.paraphrase(extra["task"]),
             VALID_STEPS: window["valid_steps"],
         }
+        if "start" in window:
+            new[TransitionKey.COMPLEMENTARY_DATA][START] = window["start"]
         if (command_tasks := self.windows.command_tasks(extra["task"])) is not None:
             new[TransitionKey.COMPLEMENTARY_DATA][COMMAND_TASKS] = command_tasks
         return new

@@ -22,10 +22,11 @@ NEAR = 0.05
 """Distance from the TCP (m) within which a block's relative position is also given with finer resolution."""
 
 
-def encoded_sizes(orientation: str, egocentric_blocks: bool) -> tuple[int, int, int]:
+def encoded_sizes(orientation: str, egocentric_blocks: bool, since_command: bool) -> tuple[int, int, int]:
     """How many numbers a robot state, a block and the scene have after `Scaler.encode`."""
     extra = 3 if orientation == "sincos" else 0
-    return STATE_DIM + extra, 6 + extra + (6 if egocentric_blocks else 0), SCENE_DIM
+    block = 6 + extra + (6 if egocentric_blocks else 0) + (9 if since_command else 0)
+    return STATE_DIM + extra, block, SCENE_DIM * (2 if since_command else 1)
 
 
 class Scaler(nn.Module):
@@ -43,11 +44,12 @@ class Scaler(nn.Module):
     delta_mean: Tensor
     delta_std: Tensor
 
-    def __init__(self, orientation: str, egocentric_blocks: bool) -> None:
+    def __init__(self, orientation: str, egocentric_blocks: bool, since_command: bool = False) -> None:
         super().__init__()
         self.orientation = orientation
         self.egocentric_blocks = egocentric_blocks
-        state, block, scene = encoded_sizes(orientation, egocentric_blocks)
+        self.since_command = since_command
+        state, block, scene = encoded_sizes(orientation, egocentric_blocks, since_command)
         sizes = {"state": state, "blocks": len(COLORS) * block, "scene": scene, "delta": DELTA_DIM}
         for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -60,19 +62,31 @@ class Scaler(nn.Module):
         position, euler = pose.split(3, dim=-1)
         return torch.cat([position, euler.sin(), euler.cos()], dim=-1)
 
-    def _encode(self, state: Tensor, environment_state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(..., 15) and (..., 24) -> robot state, flat blocks and scene, not scaled."""
+    def _encode(self, state: Tensor, environment_state: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """(..., 15), (..., 24) and (..., 24) -> robot state, flat blocks and scene, not scaled."""
         x = torch.cat([self._encode_pose(state[..., TCP_POSE]), state[..., TCP_POSE.stop :]], dim=-1)
         poses = environment_state[..., BLOCKS].unflatten(-1, (len(COLORS), 6))
         blocks = self._encode_pose(poses)
         if self.egocentric_blocks:
             offset = poses[..., :3] - state[..., None, :3]  # from the TCP, (..., 3, 3)
             blocks = torch.cat([blocks, offset, (offset / NEAR).tanh()], dim=-1)
-        return x, blocks.flatten(-2), environment_state[..., FURNITURE]
+        scene = environment_state[..., FURNITURE]
+        if self.since_command:
+            assert start is not None
+            change = environment_state - start
+            moved, turned = change[..., BLOCKS].unflatten(-1, (len(COLORS), 6)).split(3, dim=-1)
+            blocks = torch.cat([blocks, moved, turned.sin(), turned.cos()], dim=-1)
+            scene = torch.cat([change[..., FURNITURE], scene], dim=-1)
+        return x, blocks.flatten(-2), scene
 
-    def encode(self, state: Tensor, environment_state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """CALVIN's (..., 15) and (..., 24) -> scaled X (..., 15 or 18), B (..., 3, 6 to 15), S (..., 6)."""
-        x, blocks, scene = self._encode(state, environment_state)
+    def encode(
+        self, state: Tensor, environment_state: Tensor, start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """CALVIN's (..., 15) and (..., 24) -> scaled X (..., 15 or 18), B (..., 3, 6 to 24), S (..., 6 or 12).
+
+        `start`, the environment state when the command began, (..., 24), is needed with `since_command` only.
+        """
+        x, blocks, scene = self._encode(state, environment_state, start)
         x = (x - self.state_mean) / self.state_std
         blocks = (blocks - self.blocks_mean) / self.blocks_std
         scene = (scene - self.scene_mean) / self.scene_std
@@ -87,14 +101,15 @@ class Scaler(nn.Module):
         return delta * self.delta_std + self.delta_mean
 
     @torch.no_grad()
-    def fit(self, state: Tensor, environment_state: Tensor, delta: Tensor) -> None:
+    def fit(self, state: Tensor, environment_state: Tensor, delta: Tensor, start: Tensor | None = None) -> None:
         """Sets the statistics from all frames of a dataset.
 
         Args:
             state, environment_state: (T, 15) and (T, 24).
             delta: (M, 6) target motions in m and rad.
+            start: (T, 24), the environment state when each frame's command began; needed with `since_command` only.
         """
-        x, blocks, scene = self._encode(state, environment_state)
+        x, blocks, scene = self._encode(state, environment_state, start)
         for name, values, floor in (
             ("state", x, INPUT_FLOOR),
             ("blocks", blocks, INPUT_FLOOR),

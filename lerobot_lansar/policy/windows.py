@@ -104,6 +104,7 @@ class Windows:
             "environment_state": self.frames["environment_state"],
             "target": self.targets,
         }
+        self.since_command = config.since_command
         self.embeddings: dict[str, np.ndarray | Tensor] = {}
         self.clip_info: dict = {}
         if config.use_images:
@@ -159,18 +160,24 @@ class Windows:
 
         Returns:
             State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) and, with `use_images`, static and gripper
-            (B, n, D), all float32; valid_steps (N,) int64, which of the B * n steps are not padding. Padding repeats
-            the window's last step. On the GPU if the frames fit there.
+            (B, n, D), all float32; with `since_command` start (B, 1, 24), the environment state when the command
+            began; valid_steps (N,) int64, which of the B * n steps are not padding. Padding repeats the window's last
+            step. On the GPU if the frames fit there.
         """
         start, end = self.bounds(index)
         rows = start[:, None] + np.arange((end - start).max())  # (B, n)
         valid_steps = np.flatnonzero(rows < end[:, None])
         rows = np.minimum(rows, end[:, None] - 1)
+        first = self.frames["first"][start][:, None]
         frame_rows, embedding_rows = rows, self.frames["index"][rows] if self.embeddings else rows
         if self.on_gpu:
-            frame_rows, embedding_rows = (torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows))
+            frame_rows, embedding_rows, first = (
+                torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows, first)
+            )
         found = {name: array[frame_rows] for name, array in self.arrays.items()}
         found |= {name: array[embedding_rows] for name, array in self.embeddings.items()}
+        if self.since_command:
+            found["start"] = self.arrays["environment_state"][first]
         window = {name: torch.as_tensor(values).float() for name, values in found.items()}
         return window | {"valid_steps": torch.from_numpy(valid_steps)}
 

@@ -15,6 +15,7 @@ from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.processor_lansar import ClipStep, make_lansar_pre_post_processors
 from lerobot_lansar.policy.scheduler import LinearWarmupDecaySchedulerConfig
+from lerobot_lansar.policy.windows import get_current
 
 from .conftest import COMMANDS, VIDEO, add_embeddings, dataset_meta, make_dataset, observation, small_config
 
@@ -214,6 +215,29 @@ def test_a_history_is_cleared_for_the_row_whose_command_changes_and_after_the_se
     policy.reset()
     step(policy, rng, ["open the drawer", "close the drawer"])
     assert [len(history.contexts) for history in policy._histories] == [1, 1]
+
+
+def test_a_policy_sees_what_changed_since_the_command_as_in_training(relative, monkeypatch):
+    config = small_config(since_command=True, window=8, history_clear_steps=10, window_start="anywhere")
+    policy = LanSARPolicy(config, dataset_meta=dataset_meta(relative[0])).eval()
+    preprocess, _ = make_lansar_pre_post_processors_for(policy)
+    frames = get_current().frames
+    first = frames["first"][60]
+    assert 20 <= first < 60  # an episode that does not begin the dataset
+    seen, encode = [], policy.network.encode_modalities
+    monkeypatch.setattr(policy.network, "encode_modalities", lambda *a: seen.append(a) or encode(*a))
+    for t in range(first, first + 25):  # the history is cleared twice; the command goes on
+        state, environment = (torch.tensor(frames[name][t])[None] for name in ("state", "environment_state"))
+        batch = {"observation.state": state, "observation.environment_state": environment, "task": [COMMANDS[0]]}
+        policy.select_action(preprocess(batch))
+    for t, (_, blocks, scene, *_) in zip(range(first, first + 25), seen, strict=True):
+        batch = preprocess(sampled_frames(t))
+        _, expected, surroundings = policy.scaler.encode(
+            *(batch[f"{name}state"] for name in ("observation.", "observation.environment_", "start_environment_"))
+        )
+        assert torch.equal(batch["start_environment_state"][0, 0], torch.tensor(frames["environment_state"][first]))
+        torch.testing.assert_close((blocks[0], scene[0]), (expected[0, 0], surroundings[0, 0]))
+    assert not torch.equal(seen[0][1], seen[20][1])
 
 
 @pytest.mark.parametrize("options", [{}, {"mlp_norm": "layer", "command_in_context": False}, {"use_images": True}])

@@ -250,6 +250,7 @@ def test_the_thesis_preset_is_the_thesis():
         # what the thesis does not have
         "command_in_context": False,
         "egocentric_blocks": False,
+        "since_command": False,
         "paraphrases": False,
         "state_noise": 0.0,
         "contrastive_weight": 0.0,
