@@ -2,7 +2,8 @@
 
     python benchmarks/training.py [--preset=lansar] [--root=DATASET] [--batch_size=96] [--updates=10]
         [--device=cpu] [--threads=1] [--output=FILE.json]
-    python benchmarks/training.py --preset=thesis/baseline --batch_size=96 --num_workers=4 --device=cuda
+    python benchmarks/training.py --preset=thesis/no_images --device=cuda --updates=50 \
+        --variants='[float32,tf32,bfloat16,bfloat16+compile]'
 
 Reading: milliseconds of CPU per sample, a window of the preset's length (with picture embeddings if it uses them), as
 LanSAR reads it, with LeRobot's own delta timestamps, and as a bare lookup in memory-mapped arrays, the floor.
@@ -16,7 +17,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ from lerobot_lansar.policy import make_lansar_pre_post_processors
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 
+WARM_UP = 5
+"""Updates that are not measured: they allocate, choose kernels and compile."""
+
 
 @dataclass
 class Options:
@@ -44,9 +48,11 @@ class Options:
     root: Path | None = None  # a LeRobotDataset's folder
     batch_size: int = 96
     num_workers: int = 0  # processes that read samples, as --num_workers of lerobot-train
-    updates: int = 10  # measured, after two for warm-up
+    updates: int = 10  # measured, after those for warm-up
     device: str = "cpu"
-    dtype: str = "float32"  # or bfloat16: mixed precision, as --policy.dtype
+    # Of float32, tf32 (matrix products of float32 in TF32, as lerobot-train sets it), bfloat16 (mixed precision, as
+    # --policy.dtype) and each of them with +compile (as --policy.compile_model). A row for each.
+    variants: list[str] = field(default_factory=lambda: ["float32"])
     threads: int = 1
     output: Path | None = None
 
@@ -117,8 +123,8 @@ def reading(config: LanSARConfig, scratch: Path) -> dict[str, float]:
 
 def ceiling(device: str, dtype: torch.dtype) -> float:
     """TFLOP/s of a large matrix product."""
-    a, b = (torch.randn(2048, 2048, device=device, dtype=dtype) for _ in range(2))
-    count = 200 if device.startswith("cuda") else 4
+    size, count = (8192, 40) if device.startswith("cuda") else (2048, 4)
+    a, b = (torch.randn(size, size, device=device, dtype=dtype) for _ in range(2))
     for _ in range(2):
         a @ b
     finished(device)
@@ -126,7 +132,7 @@ def ceiling(device: str, dtype: torch.dtype) -> float:
     for _ in range(count):
         a @ b
     finished(device)
-    return count * 2 * 2048**3 / (time.perf_counter() - started) / 1e12
+    return count * 2 * size**3 / (time.perf_counter() - started) / 1e12
 
 
 def finished(device: str) -> None:
@@ -135,8 +141,12 @@ def finished(device: str) -> None:
         torch.cuda.synchronize()
 
 
-def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any]:
+def updates(options: Options, variant: str, config: LanSARConfig, root: Path) -> dict[str, Any]:
     """Times and arithmetic of whole updates."""
+    precision, _, compiled = variant.partition("+")
+    if precision not in ("float32", "tf32", "bfloat16") or compiled not in ("", "compile"):
+        raise ValueError(f"--variants: {variant!r} is not float32, tf32 or bfloat16, each with or without +compile.")
+    torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
     dataset = LeRobotDataset("benchmark/random", root=root)
     policy = LanSARPolicy(config, dataset_meta=dataset.meta).to(options.device).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
@@ -153,7 +163,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
     )
     if len(loader) == 0:
         raise ValueError(f"--batch_size={options.batch_size} is more than the dataset's {len(dataset)} frames.")
-    dtype = getattr(torch, options.dtype)
+    dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
     device_type = torch.device(options.device).type
 
     def batches() -> Iterator[Any]:
@@ -161,7 +171,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
             yield from loader
 
     def update(batch: dict[str, Any]) -> None:
-        with torch.autocast(device_type, dtype=torch.bfloat16, enabled=options.dtype == "bfloat16"):
+        with torch.autocast(device_type, dtype=torch.bfloat16, enabled=precision == "bfloat16"):
             loss, _ = policy.forward(batch)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10)
@@ -171,7 +181,7 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
     source = batches()
     waiting, computing, steps = [], [], []
     operations = 0
-    for number in tqdm(range(options.updates + 2), desc="Updates", leave=False):
+    for number in tqdm(range(options.updates + WARM_UP), desc="Updates", leave=False):
         start = time.perf_counter()
         batch = preprocess(next(source))
         finished(options.device)
@@ -180,48 +190,61 @@ def updates(options: Options, config: LanSARConfig, root: Path) -> dict[str, Any
             with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
                 update(batch)
             operations = counter.get_total_flops() // len(batch["valid_steps"])
+            if compiled:  # after counting: the counter does not see inside compiled code
+                policy.network.compile_transformers()
         else:
             update(batch)
         finished(options.device)
         waiting.append(ready - start)
         computing.append(time.perf_counter() - ready)
         steps.append(len(batch["valid_steps"]))
-    data, compute = (sum(values[2:]) / options.updates for values in (waiting, computing))
-    rate = operations * sum(steps[2:]) / sum(computing[2:]) / 1e12
+    data, compute = (sum(values[WARM_UP:]) / options.updates for values in (waiting, computing))
+    rate = operations * sum(steps[WARM_UP:]) / sum(computing[WARM_UP:]) / 1e12
+    largest = ceiling(options.device, dtype)
     return {
-        "preset": options.preset,
+        "variant": variant,
         "parameters": sum(p.numel() for p in policy.parameters()),
         "batch_size": options.batch_size,
-        "valid_steps_per_window": sum(steps[2:]) / options.updates / options.batch_size,
+        "valid_steps_per_window": sum(steps[WARM_UP:]) / options.updates / options.batch_size,
         "update_ms": 1000 * compute,
         "data_ms": 1000 * data,
         "windows_per_s": options.batch_size / (data + compute),
         "waiting_share": data / (data + compute),
+        "tflop_per_update": operations * sum(steps[WARM_UP:]) / options.updates / 1e12,
         "tflop_per_s": rate,
-        "share_of_ceiling": rate / ceiling(options.device, dtype),
+        "ceiling_tflop_per_s": largest,
+        "share_of_ceiling": rate / largest,
+        "warm_up_s": sum(waiting[:WARM_UP]) + sum(computing[:WARM_UP]),
         "hours_for_30000_updates": 30_000 * (data + compute) / 3600,
     }
+
+
+def write(options: Options, read: dict[str, float], rows: list[dict[str, Any]]) -> None:
+    """Writes --output."""
+    assert options.output is not None
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items() if k != "output"}
+    result = {"settings": settings, "reading_ms": read, "updates": rows}
+    options.output.write_text(json.dumps(result, indent=2) + "\n")
 
 
 @draccus.wrap()
 def main(options: Options) -> None:
     """Measures everything and prints both tables."""
     torch.set_num_threads(options.threads)
-    config = load_preset(options.preset, options.device)
     with tempfile.TemporaryDirectory() as scratch:
         read = reading(load_preset(options.preset, "cpu"), Path(scratch))
-        row = updates(options, config, options.root or Path(scratch) / "own")
+        rows = []
+        for variant in options.variants:
+            config = load_preset(options.preset, options.device)
+            rows.append(updates(options, variant, config, options.root or Path(scratch) / "own"))
+            print({name: value if isinstance(value, str) else round(value, 4) for name, value in rows[-1].items()})
+            if options.output:  # whatever becomes of the next variant
+                write(options, read, rows)
     floor = read["bare lookup"]
     print("| reading a sample | ms of CPU | times the floor |\n| --- | ---: | ---: |")
     for name, value in read.items():
         print(f"| {name} | {value:.3f} | {value / floor:.1f} |")
-    for name, number in row.items():
-        print(f"{name:>24}  {number if isinstance(number, str | int) else round(number, 4)}")
-    if options.output:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        settings = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(options).items() if k != "output"}
-        result = {"settings": settings, "reading_ms": read, "updates": row}
-        options.output.write_text(json.dumps(result, indent=2) + "\n")
 
 
 if __name__ == "__main__":

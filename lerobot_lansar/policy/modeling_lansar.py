@@ -112,6 +112,8 @@ class LanSARPolicy(PreTrainedPolicy):
                 torch.tensor(environment_state[windows.frames["first"]]) if config.since_command else None,
             )
             set_current(windows)
+            if config.compile_model:
+                self.network.compile_transformers(config.compile_mode)
             self._losses = Losses()
             if (parser.parse_arg("resume") or "").lower() == "true":
                 self._losses.load(Path(str(config.pretrained_path)))
@@ -140,7 +142,12 @@ class LanSARPolicy(PreTrainedPolicy):
                 )
 
     def get_optim_params(self) -> Any:
-        return parameter_groups(self) if self.config.optimizer == "muon" else list(self.parameters())
+        if self.config.optimizer == "muon":
+            return parameter_groups(self)
+        parameters = list(self.parameters())
+        if parameters[0].is_cuda:  # one kernel that reads and writes everything once
+            return [{"params": parameters, "fused": True}]
+        return parameters
 
     def reset(self) -> None:
         """Clears all histories; LeRobot calls this before each batch of episodes."""

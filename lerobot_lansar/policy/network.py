@@ -27,6 +27,7 @@ mask is needed. Padded steps never enter an MLP, where they would distort BatchN
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -227,6 +228,22 @@ class LanSARNetwork(nn.Module):
         self.motion_head = head_mlp(h, 6, norm, p)
         self.gripper_head = head_mlp(h, 1, norm, p)
         self.apply(self._initialise)
+        self._encode_context, self._decode = self.encode_context, self.decode  # `compile_transformers` replaces them
+
+    def compile_transformers(self, mode: str = "default", backend: str = "inductor") -> None:
+        """Makes `forward` run the two transformers through torch.compile; weights keep their names.
+
+        Steps and windows vary from batch to batch, so their number is a variable of the compiled code. Attention,
+        encoding and decoding of single steps (`encode_context`, `decode`) stay as they are.
+
+        Args:
+            mode, backend: Of torch.compile.
+        """
+        options: dict[str, Any] = {"dynamic": True, "backend": backend}
+        if backend == "inductor":
+            options["mode"] = mode
+        self._encode_context = torch.compile(self.encode_context, **options)
+        self._decode = torch.compile(self.decode, **options)
 
     @staticmethod
     def _initialise(module: nn.Module) -> None:
@@ -268,14 +285,14 @@ class LanSARNetwork(nn.Module):
         commands = self.encode_command(command)
         modalities = self.encode_modalities(state, blocks, scene, static, gripper)
         states = self.state_target(state)
-        contexts = self.encode_context(modalities, commands[0][valid_steps // n])
+        contexts = self._encode_context(modalities, commands[0][valid_steps // n])
 
         def pad(steps: Tensor) -> Tensor:
             """(N, h) -> (B, n, h), zeros where there is padding."""
             padded = steps.new_zeros(batch * n, steps.shape[-1]).index_copy(0, valid_steps, steps)
             return padded.unflatten(0, (batch, n))
 
-        decoded = self.decode(pad(contexts), pad(states), commands)
+        decoded = self._decode(pad(contexts), pad(states), commands)
         motion, logit = self.predict(decoded.flatten(0, 1)[valid_steps])
         contrast = None
         if self.config.contrastive and command_tasks is not None:

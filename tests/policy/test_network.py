@@ -1,5 +1,6 @@
 """The network alone: what it computes, what each token may see, and what each ablation removes."""
 
+import copy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -302,6 +303,28 @@ def test_commands_that_share_a_task_are_no_negatives_in_the_contrastive_loss():
         network(**inputs)
     for labels in seen:
         assert labels.tolist() == [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]]
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer"])
+def test_compiled_transformers_compute_the_same_with_the_same_weights_at_any_size(norm):
+    network = build(dropout=0.0, mlp_norm=norm).train()
+    compiled = copy.deepcopy(network)
+    compiled.compile_transformers(backend="aot_eager")
+    assert compiled.state_dict().keys() == network.state_dict().keys()
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    for lengths in ((8, 3, 5), (4, 6, 6, 2), (7, 8)):
+        inputs = windows(network.config, lengths)
+        outputs = []
+        for each in (network, compiled):
+            each.zero_grad()
+            motion, logit, _ = each(**inputs)
+            (motion.square().sum() + logit.sum()).backward()
+            outputs.append([motion, logit, *(p.grad for p in each.parameters())])
+        for one, other in zip(*outputs, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    counts = torch._dynamo.utils.counters["stats"]
+    assert counts["unique_graphs"] == 2  # one for each transformer, not one for each size
 
 
 def test_neither_forward_nor_backward_pass_synchronises_a_gpu():
