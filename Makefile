@@ -1,10 +1,11 @@
 # Two commands: `make quickstart` and `make test`. Each first sets up what it needs; later runs skip that.
 #   make PYTHON=/path/to/python3.12 …   uses this interpreter instead of the first one found
 
-.PHONY: help install quickstart test lint benchmarks clean
+.PHONY: help install quickstart thesis test lint benchmarks clean
 
 help:
 	@echo "make quickstart   environment, demonstrations, conversion, training, evaluation, report"
+	@echo "make thesis       the thesis' size, trained on a GPU and evaluated; MINUTES=60 is how long it may take"
 	@echo "make test         environment, all tests"
 	@echo "make install      environment only: .venv with the plugin installed editable"
 	@echo "make lint         ruff and mypy"
@@ -18,6 +19,9 @@ install: .venv/.installed
 
 quickstart: install
 	@.venv/bin/python scripts/quickstart.py
+
+thesis: install
+	@.venv/bin/python scripts/thesis.py --minutes=$(or $(MINUTES),60)
 
 test: install
 	@.venv/bin/python -m pytest -n auto --maxprocesses 8 --dist loadfile
