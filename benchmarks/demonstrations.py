@@ -1,10 +1,11 @@
 """How often the demonstrator succeeds: every task in every scene, from seeded random feasible starts.
 
     python benchmarks/demonstrations.py [--starts=200] [--scenes='[A,B,C,D]'] [--assets=DIR] [--workers=2] \
-        [--output=FILE.json]
+        [--interrupt=true] [--output=FILE.json]
 
-Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. Results in FILE that come from the
-same code and options are kept and not measured again.
+Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. With `--interrupt`, each start is a
+takeover in the middle of the task, see `lerobot_lansar/demos/interrupted.py`. Results in FILE that come from the same
+code and options are kept and not measured again.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from tqdm import tqdm
 import lerobot_lansar
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
 from lerobot_lansar.demos.demonstrator import demonstrate
+from lerobot_lansar.demos.interrupted import finishes, interrupt
 from lerobot_lansar.desk import Desk, SimulationError
 
 SEED = 1_000_000
@@ -34,28 +36,40 @@ class Options:
     scenes: list[str] = field(default_factory=lambda: list(SCENE_NAMES))
     # The `data` folder of a calvin_env checkout; the built-in desk by default.
     assets: str | None = None
+    # Interrupt the demonstrator, disturb the desk, and count whether another demonstrator finishes.
+    interrupt: bool = False
     workers: int = 2
     output: Path | None = None
 
 
-def measure(job: tuple[str, str, str | None, int]) -> tuple[str, str, list[int]]:
-    """Scene, task, and the length in frames of each demonstration, 0 where it failed."""
-    scene, task, assets, starts = job
+def measure(job: tuple[str, str, str | None, int, bool]) -> tuple[str, str, list[int]]:
+    """Scene, task, and each demonstration's length in frames: 0 where it failed, -1 where it had become impossible."""
+    scene, task, assets, starts, interrupted = job
     lengths = []
     with Desk(scene, assets, cameras=()) as desk:
         for k in range(starts):
+            rng = np.random.default_rng([SEED, k])
             try:
-                found = demonstrate(desk, task, np.random.default_rng([SEED, k]))
+                lengths.append((_finish if interrupted else _demonstrate)(desk, task, rng))
             except SimulationError:
-                found = None
-            lengths.append(0 if found is None else len(found))
+                lengths.append(0)
     return scene, task, lengths
+
+
+def _demonstrate(desk: Desk, task: str, rng: np.random.Generator) -> int:
+    found = demonstrate(desk, task, rng)
+    return 0 if found is None else len(found)
+
+
+def _finish(desk: Desk, task: str, rng: np.random.Generator) -> int:
+    takeover = interrupt(desk, task, rng)
+    return finishes(desk, task, takeover, rng) if takeover.feasible else -1
 
 
 def code_and_options(options: Options) -> str:
     """A hash of the code and the options that decide the results."""
     package = Path(lerobot_lansar.__file__).parent
-    digest = hashlib.sha256(f"{options.starts} {options.assets}".encode())
+    digest = hashlib.sha256(f"{options.starts} {options.assets} {options.interrupt}".encode())
     for file in sorted((*package.glob("desk/*.py"), *package.glob("demos/**/*.py"))):
         digest.update(file.read_bytes())
     return digest.hexdigest()
@@ -70,7 +84,7 @@ def main() -> None:
         stored = json.loads(options.output.read_text())
         known = stored["lengths"] if stored["state"] == state else {}
     jobs = [
-        (scene, task, options.assets, options.starts)
+        (scene, task, options.assets, options.starts, options.interrupt)
         for task in TASKS
         for scene in options.scenes
         if f"{scene} {task}" not in known
@@ -85,11 +99,14 @@ def main() -> None:
     print("| --- |" + " ---: |" * (len(options.scenes) + 1))
     for task in TASKS:
         rows = [np.array(known[f"{scene} {task}"]) for scene in options.scenes]
-        rates = " | ".join(f"{100 * np.mean(row > 0):.1f}" for row in rows)
+        rates = " | ".join(f"{100 * np.mean(row[row >= 0] > 0):.1f}" for row in rows)
         every = np.concatenate(rows)
         print(f"| {task} | {rates} | {every[every > 0].mean():.0f} |")
     every = np.concatenate([np.array(known[f"{s} {t}"]) for s in options.scenes for t in TASKS])
-    print(f"\n{np.count_nonzero(every)} of {len(every)} succeeded ({100 * np.mean(every > 0):.2f} %)")
+    possible = every[every >= 0]
+    print(f"\n{np.count_nonzero(possible)} of {len(possible)} succeeded ({100 * np.mean(possible > 0):.2f} %)")
+    if options.interrupt:
+        print(f"{len(every) - len(possible)} takeovers left out: the task had become impossible")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ skills/          what to do: waypoints for each of the 34 tasks
 moves            what skills are built from: waypoints, the view of the desk, travelling, grasps
 motion           waypoints to actions: smooth, with noise
 demonstrator     one task, from a random start or from where the desk is
+interrupted      takeovers in the middle of a task, to measure the demonstrator by
 play             tasks one after the other without a reset, and the language windows cut from that
 calvin_folder    frames, windows and sentences on disk
 record_config    the options of lansar-record

@@ -45,17 +45,25 @@ def carry_out(
     skill: Skill,
     rng: np.random.Generator,
     *,
+    start: Observation | None = None,
+    before: Observation | None = None,
     variety: float = 1.0,
     noise: float = 0.2,
     steps: int = STEPS_PER_COMMAND,
 ) -> Iterator[tuple[Frame, Observation, Snapshot]]:
     """Carries out a skill from the present state to the skill's end, or until the caller has seen enough.
 
+    The present state may be anywhere in the middle of the command, however it came about: a skill does what is left to
+    do since `start`.
+
     Args:
         desk: In the state that `obs` shows.
         obs: The latest observation.
         skill: Where the hand goes.
         rng: The only source of randomness: style and noise.
+        start: The observation when the command began; None: `obs`.
+        before: The observation one control step before `obs`, from which the hand's velocity follows; None: the hand
+            is at rest.
         variety, noise: As for `demonstrate`.
         steps: Maximum number of control steps.
 
@@ -63,8 +71,9 @@ def carry_out(
         For each control step its frame (the observation before it, `actions`, `rel_actions`), and the observation
         and the snapshot after it.
     """
-    view = View(desk.scene, obs["robot_obs"], obs["scene_obs"], rng, Style.sample(rng, variety))
-    motion = Motion(obs["robot_obs"], view.style.speed)
+    begun = obs if start is None else start
+    view = View(desk.scene, obs["robot_obs"], obs["scene_obs"], rng, Style.sample(rng, variety), begun)
+    motion = Motion(obs["robot_obs"], view.style.speed, None if before is None else before["robot_obs"])
     disturbance = Disturbance(noise, rng)
     for waypoint in skill(view):
         pause = int(rng.integers(1, 9)) if rng.uniform() < view.style.pauses else 0

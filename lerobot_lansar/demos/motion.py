@@ -32,12 +32,17 @@ class Motion:
     Args:
         robot_obs: (15,), where the motion begins.
         speed: Fraction of `TOP_SPEED` and `TOP_TURN`.
+        before: (15,), one control step earlier; None: the hand is at rest.
     """
 
-    def __init__(self, robot_obs: np.ndarray, speed: float):
+    def __init__(self, robot_obs: np.ndarray, speed: float, before: np.ndarray | None = None):
         self._speed = speed
         self._plan = robot_obs[TCP_POSE].copy()
         self._velocity: np.ndarray = np.zeros(6)
+        if before is not None:
+            velocity = _difference(robot_obs[TCP_POSE], before[TCP_POSE])
+            self._velocity[:3] = np.clip(velocity[:3], -TOP_SPEED, TOP_SPEED)
+            self._velocity[3:] = np.clip(velocity[3:], -TOP_TURN, TOP_TURN)
 
     def error(self, waypoint: Waypoint, robot_obs: np.ndarray) -> tuple[float, float]:
         """Distance left to the waypoint (m), and the largest angle left (rad)."""

@@ -4,8 +4,8 @@ Positions in metres in the world frame, angles in radians. A hand that points st
 `pointing` gives the euler angles of a leaning hand.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -95,13 +95,25 @@ class Style:
 
 @dataclass
 class View:
-    """What a skill sees: the scene's geometry and the latest `robot_obs` (15,) and `scene_obs` (24,)."""
+    """What a skill sees: the scene's geometry, the latest `robot_obs` (15,) and `scene_obs` (24,), and the observation
+    when the command began (None: the present one)."""
 
     scene: Scene
     robot_obs: np.ndarray
     scene_obs: np.ndarray
     rng: np.random.Generator
     style: Style = field(default_factory=Style)
+    begun: Mapping[str, np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        if self.begun is None:
+            self.begun = {"robot_obs": self.robot_obs, "scene_obs": self.scene_obs}
+
+    @property
+    def start(self) -> "View":
+        """The same as it was when the command began."""
+        assert self.begun is not None
+        return replace(self, robot_obs=self.begun["robot_obs"], scene_obs=self.begun["scene_obs"])
 
     @property
     def tcp(self) -> np.ndarray:
@@ -236,6 +248,19 @@ def travel(
     if np.linalg.norm(view.tcp[:2] - [x, y]) > 0.04 or in_cabinet(view.tcp):
         yield from retreat(view, gripper, keep)
         yield view.go((x, y, max(z, view.style.cruise)), gripper, euler, tolerance=0.03, keep=keep)
+
+
+def under_way(view: View, start: np.ndarray, end: np.ndarray, euler: np.ndarray, gripper: float) -> bool:
+    """Whether the hand is already on the straight way from `start` to `end`, (3,) each, and need not go to `start`.
+
+    That is within 0.012 m and 0.15 rad, and with the hand open or closed as commanded by `gripper`.
+    """
+    way = end - start
+    along = np.clip((view.tcp - start) @ way / (way @ way), 0.0, 1.0)
+    aside = np.linalg.norm(view.tcp - start - along * way)
+    turn = (Rotation.from_euler("xyz", view.euler).inv() * Rotation.from_euler("xyz", euler)).magnitude()
+    opened = view.robot_obs[GRIPPER_WIDTH] > 0.07 if gripper > 0 else view.robot_obs[GRIPPER_WIDTH] < 0.01
+    return bool(aside < 0.012 and turn < 0.15 and opened)
 
 
 def lying(pose: np.ndarray) -> tuple[float, bool]:

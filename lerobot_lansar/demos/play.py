@@ -15,7 +15,7 @@ from .calvin_folder import FrameWriter, Unit
 from .demonstrator import AFTERWARDS, Frame, carry_out
 from .moves import FALLEN, Style, View, Waypoint, lying
 from .skills import SKILLS
-from .skills.table import put_down
+from .skills.blocks import put_down
 
 _SHORTEST = 32  # frames in a window, unless its recording began later
 _PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each frame 1.58 times

@@ -6,11 +6,22 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lerobot_lansar.calvin import DRAWER, STEPS_PER_COMMAND, TASKS, relative_action
+from lerobot_lansar.calvin import (
+    COLORS,
+    DRAWER,
+    GRIPPER_ACTION,
+    GRIPPER_WIDTH,
+    STEPS_PER_COMMAND,
+    TASKS,
+    block_pose,
+    relative_action,
+)
 from lerobot_lansar.demos.demonstrator import carry_out, demonstrate
+from lerobot_lansar.demos.interrupted import finishes, interrupt
 from lerobot_lansar.demos.motion import TOP_SPEED, Disturbance
 from lerobot_lansar.demos.skills import SKILLS
 from lerobot_lansar.desk import SCENES, Desk, DeskError, SimulationError, is_fulfilled
+from lerobot_lansar.desk.scenes import TABLE_Z
 from lerobot_lansar.desk.starts import sample_start
 from lerobot_lansar.jobs.pool import in_processes
 
@@ -159,6 +170,87 @@ def test_a_block_that_slipped_is_taken_again(task, when, monkeypatch):
     again = [d.frames["actions"][:, 6] for d in tries if d is not None]
     assert len(again) >= 3
     assert sum((np.diff(gripper) < 0).sum() >= 2 for gripper in again) >= 3  # closed, lost it, closed again
+
+
+def takeovers(job):
+    """How many of a task's possible takeovers end in success, and how many takeovers were possible."""
+    scene, task, count = job
+    done = possible = 0
+    with Desk(scene, cameras=()) as desk:
+        for k in range(count):
+            rng = np.random.default_rng([6, k, list(TASKS).index(task)])
+            try:
+                takeover = interrupt(desk, task, rng)
+                possible += takeover.feasible
+                done += takeover.feasible and finishes(desk, task, takeover, rng) > 0
+            except SimulationError:
+                continue
+    return done, possible
+
+
+def test_another_demonstrator_finishes_what_was_interrupted():
+    jobs = [(scene, task, 1) for scene in "BD" for task in list(TASKS)[scene == "D" :: 2]]
+    done, possible = np.sum([takeovers(job) for job in jobs], axis=0)
+    assert possible >= 0.8 * len(jobs)
+    assert done >= 0.95 * possible
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+@pytest.mark.parametrize("scene", SCENES)
+def test_interrupted_tasks_of_every_kind_are_finished(scene):
+    jobs = [(scene, task, 10) for task in TASKS]
+    done, possible = np.sum(in_processes(takeovers, jobs, os.cpu_count(), ordered=True), axis=0)
+    assert possible >= 0.8 * 10 * len(jobs)
+    assert done >= 0.95 * possible
+
+
+@pytest.mark.parametrize(("done", "task"), [(0.7, "right"), (-0.7, "right"), (0.7, "left"), (-0.7, "left")])
+def test_a_block_half_turned_is_turned_the_rest(done, task):
+    """By 60 degrees from where it lay at the command, which is the state `start`."""
+    name = f"rotate_red_block_{task}"
+    with Desk("D", cameras=()) as desk:
+        rng = np.random.default_rng(8)
+        start = desk.reset(*sample_start(desk, name, rng))
+        begun = desk.snapshot()
+        turned = start["scene_obs"].copy()
+        turned[block_pose(0)][5] += done
+        obs = desk.reset(start["robot_obs"], turned)
+        steps = carry_out(desk, obs, SKILLS[name], rng, start=start, noise=0.0)
+        assert any(is_fulfilled(name, begun, now) for *_, now in steps)
+
+
+def test_the_block_held_at_the_command_is_placed_not_the_nearest_one():
+    with Desk("D", cameras=()) as desk:
+        rng = np.random.default_rng(1)
+        start = desk.reset(*sample_start(desk, "place_in_drawer", rng))
+        begun = desk.snapshot()
+        (held,) = begun.touched_by_robot
+        dropped = start["scene_obs"].copy()
+        dropped[block_pose(COLORS.index(held))] = [0.2, -0.1, TABLE_Z, 0, 0, np.pi / 2]
+        other = next(c for c in COLORS if c != held)
+        dropped[block_pose(COLORS.index(other))] = [0.05, -0.1, TABLE_Z, 0, 0, np.pi / 2]
+        away = start["robot_obs"].copy()
+        away[GRIPPER_WIDTH], away[GRIPPER_ACTION] = 0.08, 1.0
+        obs = desk.reset(away, dropped)
+        steps = carry_out(desk, obs, SKILLS["place_in_drawer"], rng, start=start, noise=0.0)
+        assert any(is_fulfilled("place_in_drawer", begun, now) for *_, now in steps)
+
+
+def test_a_moving_hand_goes_on_moving():
+    """The first action continues at the speed that `before` shows; without `before` it starts from rest."""
+    first = {}
+    led = SKILLS["turn_on_led"]
+    with Desk("D", cameras=()) as desk:
+        start = sample_start(desk, "turn_on_led", np.random.default_rng(0))
+        for known in (False, True):
+            before = now = desk.reset(*start)
+            for _, after, _ in carry_out(desk, now, led, np.random.default_rng(0), noise=0.0, steps=12):
+                before, now = now, after
+            rng = np.random.default_rng(0)
+            frame, *_ = next(carry_out(desk, now, led, rng, before=before if known else None, noise=0.0))
+            first[known] = np.linalg.norm(frame["rel_actions"][:3])
+    assert first[True] > 2 * first[False]
 
 
 def test_a_drawer_that_slid_back_is_pulled_again():

@@ -8,10 +8,10 @@ table        turning blocks and pushing them over the table
 furniture    drawer, door, switch and button
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from ...calvin import TASKS, Task
-from ..moves import Skill
+from ..moves import Skill, View, Waypoint
 from . import blocks, furniture, table
 
 
@@ -43,5 +43,19 @@ def _order(task: Task) -> tuple[int, bool]:
     return list(_BY_KIND).index(task.kind), task.color is not None and task.side == "left"
 
 
-SKILLS: dict[str, Skill] = {task.name: _BY_KIND[task.kind](task) for task in sorted(TASKS.values(), key=_order)}
+def _with_free_hand(task: Task) -> Skill:
+    """The task's skill, which first puts down a block that the task is not about."""
+    skill = _BY_KIND[task.kind](task)
+
+    def freed(view: View) -> Iterator[Waypoint]:
+        held = view.held()
+        wanted = {task.color, view.start.held(), blocks.top_of_stack(view.start)}
+        if held is not None and held not in wanted and task.kind != "push_into_drawer":
+            yield from blocks.put_down(view)
+        yield from skill(view)
+
+    return freed
+
+
+SKILLS: dict[str, Skill] = {task.name: _with_free_hand(task) for task in sorted(TASKS.values(), key=_order)}
 """How each of the 34 tasks is done."""

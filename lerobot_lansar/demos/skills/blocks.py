@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 
 from ...calvin import COLORS
-from ...desk.scenes import BLOCK_SIDE, DOOR_WIDTH, DRAWER_Z, TABLE_Z
+from ...desk.scenes import BLOCK_SIDE, BUTTON_Y, DOOR_WIDTH, DRAWER_Z, TABLE_Z
 from ..moves import (
     CLOSED,
     FORWARD,
@@ -29,7 +29,11 @@ from ..moves import (
     stretch,
     travel,
     turned,
+    under_way,
 )
+
+EDGE = 0.415
+"""|x| (m) up to which blocks are set down on the table, which ends at 0.44."""
 
 # ---- taking
 
@@ -38,7 +42,8 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
     """TCP position (3,) m and euler (3,) rad from which the fingers close on a block where it lies."""
     position = view.block(color)[:3] + [0.0, 0.0, 0.002]
     if in_cabinet(position):
-        position[0] = np.clip(position[0], *_finger_room(view, position[0]))
+        if position[1] > 0.02:  # behind the door
+            position[0] = np.clip(position[0], *_finger_room(view, position[0]))
         deep = np.clip(position[1] - 0.085, 0.0, 0.04)  # so deep inside the hand itself would touch the door
         position[1] -= 0.3 * deep
         # a leaning hand that is also turned has one finger lower than the other: turn it half as far as the block
@@ -47,6 +52,8 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
         return position, pointing(yaw, 0.0, INTO_CABINET + 5 * deep)
     if abs(position[2] - TABLE_Z) > 0.025:  # in the drawer, or on another block
         position[2] += 0.008
+    elif position[1] > -0.07 and 0.4 < abs(yaw - FORWARD) < 0.9:  # a turned hand would hit the cabinet
+        yaw = FORWARD + (yaw - FORWARD) / 2
     return position, pointing(yaw, *stretch(position))
 
 
@@ -88,18 +95,19 @@ def _draw_in(view: View, color: str) -> Iterator[Waypoint]:
 
 def take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     """Moves the open hand around a block and closes it; `turn` (rad) is how far the wrist must turn afterwards."""
-    if in_cabinet(view.block(color)):
+    if in_cabinet(view.block(color)) and view.block(color)[1] > 0.02:
         yield from _draw_in(view, color)
     yaws = grasp_yaws(view, color)
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw + turn <= YAWS[1]] or yaws
     yaw = yaws[0] + view.scatter(0.08)
     position, euler = _hold(view, color, yaw)
     lead = 0.2 if in_cabinet(position) else 0.08 + abs(view.scatter(0.03))
-    gripper = OPEN if view.held() else view.style.idle_gripper
-    yield from travel(view, position - lead * approach(euler), gripper, euler)
-    yield view.go(position - 0.8 * lead * approach(euler), OPEN, euler, tolerance=0.012)
-    position, euler = _hold(view, color, yaw)
-    yield view.go(position - 0.03 * approach(euler), OPEN, euler, slow=0.9, tolerance=0.01)
+    if not under_way(view, position - 0.8 * lead * approach(euler), position, euler, OPEN):
+        gripper = OPEN if view.held() else view.style.idle_gripper
+        yield from travel(view, position - lead * approach(euler), gripper, euler)
+        yield view.go(position - 0.8 * lead * approach(euler), OPEN, euler, tolerance=0.012)
+        position, euler = _hold(view, color, yaw)
+        yield view.go(position - 0.03 * approach(euler), OPEN, euler, slow=0.9, tolerance=0.01)
     position, euler = _hold(view, color, yaw)
     yield view.go(position, OPEN, euler, slow=0.7, tolerance=0.006)
     yield view.go(view.tcp.copy(), CLOSED, euler, hold=4, tolerance=0.02)
@@ -123,8 +131,8 @@ def lift(color: str) -> Skill:
 
 def unstack_block(view: View) -> Iterator[Waypoint]:
     """Take the upper block and lift it."""
+    top = top_of_stack(view.start) or top_of_stack(view)
     for _ in range(TRIES):
-        top = _top_of_stack(view) or view.held()
         if top is None or view.lost(top):
             return
         if not view.holds(top):
@@ -138,7 +146,8 @@ def unstack_block(view: View) -> Iterator[Waypoint]:
         )
 
 
-def _top_of_stack(view: View) -> str | None:
+def top_of_stack(view: View) -> str | None:
+    """The block directly on top of another one, if any."""
     pairs = permutations(COLORS, 2)
     return next((upper for upper, lower in pairs if view.lies_on(upper, lower, height=0.07)), None)
 
@@ -165,12 +174,38 @@ def set_down_from_above(view: View, color: str, place: np.ndarray, yaw: float, h
     return _set_down(view, color, [(above, 0.9, 0.008), (place, 0.7, 0.008)], pointing(yaw, *stretch(place)))
 
 
+def landing(view: View, color: str, xs: np.ndarray) -> np.ndarray:
+    """A free place (2,) m on the table with x among `xs`, as near to the block as possible."""
+    pose, radius = view.block(color), view.length(color) / 2
+    best, lowest = np.array([xs[0], pose[1]]), np.inf
+    for x in xs[np.abs(xs) <= EDGE]:
+        for y in np.linspace(-0.14, -0.04, 6):
+            if abs(x - view.scene.button_x) < radius + 0.05 and abs(y - BUTTON_Y) < radius + 0.05:
+                continue
+            place = np.array([x, y])
+            room = min(float(np.linalg.norm(other[:2] - place)) for other in view.others(color))
+            cost = abs(x - pose[0]) + abs(y - pose[1]) + 5 * max(0.0, 0.1 - room)
+            if cost < lowest:
+                best, lowest = place, cost
+    return best
+
+
+def put_down(view: View) -> Iterator[Waypoint]:
+    """Set the block in the hand down on the table, or open the hand; serves no task."""
+    color = view.held()
+    if color is None:
+        yield view.go(view.tcp.copy(), OPEN, view.euler, hold=5)
+    else:
+        place = np.array([*landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
+        yield from set_down_from_above(view, color, place, view.yaw, 0.55)
+
+
 def _carrying(carry: Callable[[View, str], Iterator[Waypoint]]) -> Skill:
-    """A skill that carries the block in the hand somewhere, and takes it again if it slipped."""
+    """A skill that carries the block held when the command began somewhere; it takes that one again if it slipped."""
 
     def skill(view: View) -> Iterator[Waypoint]:
-        nearest = min(COLORS, key=lambda c: float(np.linalg.norm(view.block(c)[:3] - view.tcp)))
-        color = view.held() or nearest
+        begun = view.start
+        color = min(COLORS, key=lambda c: float(np.linalg.norm(begun.block(c)[:3] - begun.tcp)))
         for _ in range(2 * TRIES):
             if view.lost(color):
                 return
@@ -185,13 +220,15 @@ def _carrying(carry: Callable[[View, str], Iterator[Waypoint]]) -> Skill:
     return skill
 
 
-@_carrying
-def place_in_drawer(view: View, color: str) -> Iterator[Waypoint]:
+def into_drawer(view: View, color: str) -> Iterator[Waypoint]:
     """Carry the block over the drawer, lower it and let go."""
     y = (-0.157 - view.drawer + TABLE_FRONT) / 2
     places = [np.array([view.scene.drawer_x + x, y, 0.0]) for x in (0.0, 0.05, -0.05, 0.1, -0.1)]
     place = _freest(view, color, places) + [view.scatter(0.03), view.scatter(0.015), DRAWER_Z + 0.03]
     yield from set_down_from_above(view, color, place, view.yaw, 0.55)
+
+
+place_in_drawer = _carrying(into_drawer)
 
 
 @_carrying

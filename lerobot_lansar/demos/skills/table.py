@@ -1,4 +1,4 @@
-"""Moving blocks about on the table: turning, pushing, pushing into the drawer, setting down."""
+"""Moving blocks about on the table: turning, pushing, pushing into the drawer."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -21,47 +21,58 @@ from ..moves import (
     lying,
     on_table,
     pointing,
-    retreat,
     stretch,
     travel,
-    turned,
+    under_way,
 )
-from .blocks import set_down_from_above, take
-
-EDGE = 0.415
-"""|x| (m) up to which blocks are set down on the table, which ends at 0.44."""
+from .blocks import EDGE, into_drawer, landing, take
 
 
 def rotate(color: str, direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Take the block where it lies, turn the wrist and let go; turn further if that was not enough."""
         wanted = direction * (1.3 + view.scatter(0.1))
-        start = lying(view.block(color))[0]
-        origin = view.block(color)[:3].copy()
+        start = view.start.block(color)
 
         keep = partial(view.holds, color)
-        for _ in range(TRIES):
+        for _ in range(2 * TRIES):
             if view.lost(color):
                 return
-            done = wrap_angle(lying(view.block(color))[0] - start)
-            left = wanted - done
+            left = wanted - wrap_angle(lying(view.block(color))[0] - lying(start)[0])
             if not keep():
                 yield from take(view, color, left)
                 if not keep():
                     continue
-            yaw = view.yaw
-            end = float(np.clip(yaw + left, *YAWS))
-            ground = view.tcp.copy()
+            end = float(np.clip(view.yaw + left, *YAWS))
             # away from the cabinet, which a turned hand would hit; the oracle lets the block move by 0.1 m
-            place = np.array([ground[0], min(ground[1], max(origin[1] - 0.085, -0.11)), ground[2]])
-            lean = stretch(place)
-            yield view.go(place, CLOSED, pointing(end, *lean), tolerance=0.01, keep=keep)
-            if not keep():
-                continue
-            yield view.go(place, OPEN, pointing(end, *lean), tolerance=0.02, hold=4)
-            yield view.go(place + [0, 0, 0.09], OPEN, pointing(end, *lean), tolerance=0.02)
+            x = float(np.clip(view.tcp[0], start[0] - 0.05, start[0] + 0.05))
+            front, back = max(start[1] - 0.085, -0.14), max(start[1] - 0.085, -0.11)
+            place = np.array([x, np.clip(view.tcp[1], front, back), _ground(view, color)])
+            yield from _over(view, color, place)
+            yield view.go(place, CLOSED, pointing(end, *stretch(place)), tolerance=0.01, keep=keep)
+            if keep():
+                yield from _let_go(view, place, pointing(end, *stretch(place)))
 
     return skill
+
+
+def _ground(view: View, color: str) -> float:
+    """Height (m) of the TCP at which the block in the hand stands on the table."""
+    return float(TABLE_Z + view.tcp[2] - view.block(color)[2])
+
+
+def _over(view: View, color: str, place: np.ndarray) -> Iterator[Waypoint]:
+    """Brings a block that is not held low over the table to above `place` (3,)."""
+    if not on_table(view.block(color)) or view.tcp[2] > place[2] + 0.03:
+        keep = partial(view.holds, color)
+        yield from travel(view, place, CLOSED, pointing(view.yaw, *stretch(place)), keep)
+        yield view.go(place + [0, 0, 0.055], CLOSED, pointing(view.yaw, *stretch(place)), tolerance=0.015, keep=keep)
+
+
+def _let_go(view: View, place: np.ndarray, euler: np.ndarray) -> Iterator[Waypoint]:
+    """Opens the hand at `place` (3,) and lifts it."""
+    yield view.go(place, OPEN, euler, tolerance=0.02, hold=4)
+    yield view.go(place + [0, 0, 0.09], OPEN, euler, tolerance=0.02)
 
 
 def _shove(view: View, color: str, direction: np.ndarray, distance: float) -> Iterator[Waypoint]:
@@ -72,9 +83,12 @@ def _shove(view: View, color: str, direction: np.ndarray, distance: float) -> It
     z = block[2] + 0.007
     start = np.array([*(block[:2] - direction * behind + side), z])
     euler = pointing(FORWARD + view.style.yaw, *stretch(start))
-    yield from travel(view, start + [0, 0, 0.08], view.style.idle_gripper, euler)
-    yield view.go(start + [0, 0, 0.06], CLOSED, euler, tolerance=0.012)
-    yield view.go(start, CLOSED, euler, slow=0.8, tolerance=0.008)
+    ahead = np.array([*(0.03 * direction), 0.0])
+    if not under_way(view, start - ahead, start + ahead, euler, CLOSED):
+        if not under_way(view, start + [0, 0, 0.06], start, euler, CLOSED):
+            yield from travel(view, start + [0, 0, 0.08], view.style.idle_gripper, euler)
+            yield view.go(start + [0, 0, 0.06], CLOSED, euler, tolerance=0.012)
+        yield view.go(start, CLOSED, euler, slow=0.8, tolerance=0.008)
     end = np.array([*(start[:2] + direction * (distance + 0.03 + abs(view.scatter(0.01)))), z])
     yield view.go(end, CLOSED, euler, slow=0.8)
     yield view.go(view.tcp - [*(0.02 * direction), -0.08], CLOSED, euler, tolerance=0.03)
@@ -86,34 +100,35 @@ def _carry(view: View, color: str, place: np.ndarray) -> Iterator[Waypoint]:
         yield from take(view, color)
     if not view.holds(color):
         return
-    euler = view.euler
-
     keep = partial(view.holds, color)
-    ground = view.tcp[2]
-    yield view.go(view.tcp + [0, 0, 0.06], CLOSED, euler, slow=0.8, tolerance=0.015, keep=keep)
-    target = np.array([*place, ground + 0.004])
-    lean = pointing(turned(euler[2]), *stretch(target))
-    yield view.go(target + [0, 0, 0.055], CLOSED, lean, slow=0.9, tolerance=0.015, keep=keep)
-    yield view.go(target, CLOSED, lean, slow=0.7, tolerance=0.008, keep=keep)
-    yield view.go(target, OPEN, lean, tolerance=0.02, hold=4)
-    yield view.go(target + [0, 0, 0.09], OPEN, lean, tolerance=0.02)
+    target = np.array([*place, _ground(view, color) + 0.002])
+    if on_table(view.block(color)):
+        up = max(target[2] + 0.055, view.tcp[2])
+        yield view.go((*view.tcp[:2], up), CLOSED, view.euler, slow=0.8, tolerance=0.015, keep=keep)
+    else:
+        yield from travel(view, target, CLOSED, view.euler, keep)
+    euler = pointing(view.yaw, *stretch(target))
+    yield view.go(target + [0, 0, 0.055], CLOSED, euler, slow=0.9, tolerance=0.015, keep=keep)
+    yield view.go(target, CLOSED, euler, slow=0.7, tolerance=0.008, keep=keep)
+    if keep():
+        yield from _let_go(view, target, euler)
 
 
 def push(color: str, direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Push the block sideways; carry it if the button's rim or another block is in the way."""
-        begin = view.block(color)[0]
+        begin = view.start.block(color)[0]
         for _ in range(TRIES):
             if view.lost(color):
                 return
             pose = view.block(color)
             missing = 0.125 - direction * (pose[0] - begin)
             end = pose[0] + direction * max(missing, 0.03)
-            if _way_is_free(view, color, pose, end) and abs(pose[2] - TABLE_Z) < 0.03:
+            can_be_pushed = abs(pose[2] - TABLE_Z) < 0.03 and not view.holds(color)
+            if can_be_pushed and _way_is_free(view, color, pose, end):
                 yield from _shove(view, color, np.array([direction, 0.0]), max(missing, 0.03))
             else:
-                yield from retreat(view, OPEN)
-                yield from _carry(view, color, _landing(view, color, begin + direction * np.arange(0.125, 0.34, 0.015)))
+                yield from _carry(view, color, landing(view, color, begin + direction * np.arange(0.125, 0.34, 0.015)))
 
     return skill
 
@@ -137,24 +152,8 @@ def _way_is_free(view: View, color: str, pose: np.ndarray, end: float) -> bool:
     return bool(abs(end) < EDGE)
 
 
-def _landing(view: View, color: str, xs: np.ndarray) -> np.ndarray:
-    """A free place (2,) m on the table with x among `xs`, as near to the block as possible."""
-    pose, radius = view.block(color), view.length(color) / 2
-    best, lowest = np.array([xs[0], pose[1]]), np.inf
-    for x in xs[np.abs(xs) <= EDGE]:
-        for y in np.linspace(-0.14, -0.04, 6):
-            if abs(x - view.scene.button_x) < radius + 0.05 and abs(y - BUTTON_Y) < radius + 0.05:
-                continue
-            place = np.array([x, y])
-            room = min(float(np.linalg.norm(other[:2] - place)) for other in view.others(color))
-            cost = abs(x - pose[0]) + abs(y - pose[1]) + 5 * max(0.0, 0.1 - room)
-            if cost < lowest:
-                best, lowest = place, cost
-    return best
-
-
 def push_into_drawer(view: View) -> Iterator[Waypoint]:
-    """Push the block nearest to the open drawer over the table's edge; first carry it in front of the drawer."""
+    """Push the block nearest to the open drawer over the table's edge, or put it in from above."""
     for _ in range(TRIES + 2):
         color = _nearest_to_drawer(view)
         if color is None:  # the block is tipping over the edge: wait until it lands
@@ -165,17 +164,18 @@ def push_into_drawer(view: View) -> Iterator[Waypoint]:
         half = half_width(view, color, np.array([0.0, 1.0]))
         before_drawer = abs(pose[0] - view.scene.drawer_x) < 0.13
         room_behind = pose[1] + half + 0.045 < 0.0
-        if before_drawer and room_behind and abs(pose[2] - TABLE_Z) < 0.03:
+        if before_drawer and room_behind and abs(pose[2] - TABLE_Z) < 0.03 and not view.holds(color):
             yield from _shove(view, color, np.array([0.0, -1.0]), to_edge - 0.02)
+        elif view.holds(color):
+            yield from into_drawer(view, color)
         else:
-            x = float(np.clip(pose[0], view.scene.drawer_x - 0.10, view.scene.drawer_x + 0.10))
-            yield from retreat(view, OPEN)
-            yield from _carry(view, color, np.array([x, -0.12]))
+            yield from take(view, color)
 
 
 def _nearest_to_drawer(view: View) -> str | None:
-    """The block on the table that is easiest to push into the drawer."""
+    """The block that is easiest to bring into the drawer, of those that lay on the table when the command began."""
     candidates = [color for color in COLORS if on_table(view.block(color)) or view.holds(color)]
+    candidates = [color for color in candidates if on_table(view.start.block(color))]
 
     def effort(color: str) -> float:
         pose = view.block(color)
@@ -183,13 +183,3 @@ def _nearest_to_drawer(view: View) -> str | None:
         return float(pose[1] + 3 * aside - (1.0 if view.holds(color) else 0.0))
 
     return min(candidates, key=effort, default=None)
-
-
-def put_down(view: View) -> Iterator[Waypoint]:
-    """Set the block in the hand down on the table, or open the hand; serves no task."""
-    color = view.held()
-    if color is None:
-        yield view.go(view.tcp.copy(), OPEN, view.euler, hold=5)
-    else:
-        place = np.array([*_landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
-        yield from set_down_from_above(view, color, place, view.yaw, 0.55)
