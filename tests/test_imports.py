@@ -28,9 +28,10 @@ FLOORS = [
         "lerobot_lansar.report",
         "dataset_convert",
     ),
-    ("lerobot_lansar.demos", "lerobot_lansar.envs"),
+    ("lerobot_lansar.envs",),
     (
         "lerobot_lansar.attention",
+        "lerobot_lansar.demos",
         "lerobot_lansar.evaluation",
         "lerobot_lansar.replay",
         "lerobot_lansar.cli",

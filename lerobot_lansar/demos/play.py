@@ -90,7 +90,7 @@ def _play(
     before: str | None = None
     while left > 0:
         feasible = feasible_tasks(desk.scene, last, obs)
-        task = _choose(feasible, before, rng) if feasible else None
+        task = choose_task(feasible, before, rng) if feasible else None
         if task is not None:
             unit.tried[task] = unit.tried.get(task, 0) + 1
             before = task
@@ -98,7 +98,7 @@ def _play(
         done, satisfied = False, 0
         rest = int(rng.integers(1, 6) if whole else rng.integers(2, 20))
         acting = SKILLS[task] if task is not None else put_down
-        for skill, limit in ((acting, STEPS_PER_COMMAND), (_rest, rest)):
+        for skill, limit in ((acting, STEPS_PER_COMMAND), (stay, rest)):
             for frame, after, now in carry_out(
                 desk, obs, skill, rng, variety=variety, noise=noise, steps=min(left, limit)
             ):
@@ -118,12 +118,12 @@ def _play(
             return
 
 
-def _rest(view: View) -> Iterator[Waypoint]:
+def stay(view: View) -> Iterator[Waypoint]:
     """Stay in place, with the hand as it is."""
     yield view.go(view.tcp.copy(), float(view.robot_obs[GRIPPER_ACTION]), view.euler, hold=STEPS_PER_COMMAND)
 
 
-def _choose(tasks: list[Task], before: str | None, rng: np.random.Generator) -> str:
+def choose_task(tasks: list[Task], before: str | None, rng: np.random.Generator) -> str:
     """The name of one task: kinds and places are equally likely, and none comes twice in a row if others can."""
     groups: dict[tuple[str, str], list[str]] = {}
     for task in sorted(tasks, key=_color_and_side):

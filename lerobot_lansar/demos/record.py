@@ -3,7 +3,7 @@
 import shutil
 import sys
 from collections import Counter
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from ..jobs.staging import staging
 from .calvin_folder import FrameWriter, Unit, publish_split
 from .demonstrator import Demonstration, demonstrate
 from .play import record_play
-from .record_config import SPLITS, RecordConfig
+from .record_config import SPLITS, RecordConfig, TakeoverPolicy
 from .skills import SKILLS
 
 ATTEMPTS = 20
@@ -51,6 +51,10 @@ def record(config: RecordConfig) -> Path:
     """
     config.check()
     config = _with_absolute_paths(config)
+    if config.mode == "takeovers":
+        from .takeovers import prepare  # imports LeRobot, which takes seconds
+
+        config = prepare(config)
     kinds = {_kind_of_assets(config, scene) for scene in config.scenes}
     for split, option in zip(SPLITS, ("annotations", "validation_annotations"), strict=True):
         try:
@@ -116,9 +120,28 @@ def _has_units(folder: Path) -> bool:
 def record_shard(config: RecordConfig, shard: int) -> None:
     """Records the units of one shard that do not exist yet."""
     size, total = config.shard_size(), sum(config.counts())
-    for index in range(shard * size, min((shard + 1) * size, total)):
-        if not _note(config, index).exists():
-            record_unit(config, index)
+    units = range(shard * size, min((shard + 1) * size, total))
+    missing = [index for index in units if not _note(config, index).exists()]
+    if config.mode == "takeovers":
+        _record_takeovers(config, missing)
+        return
+    for index in missing:
+        record_unit(config, index)
+
+
+def _record_takeovers(config: RecordConfig, indices: list[int]) -> None:
+    """Records sessions in which a policy acts, all at once."""
+    from .takeovers import record_sessions  # imports LeRobot, which takes seconds
+
+    units = []
+    for index in indices:
+        slot = config.slot(index)
+        frames = config.session_frames(slot.split)[slot.number]
+        seed = [config.seed, SPLITS.index(slot.split), slot.number]
+        units.append((index, slot.split, slot.scene, frames, seed, config.output_dir / STAGING / f"{index:06d}"))
+    sentences = {split: load_commands(config.annotations_of(split), split) for split in SPLITS}
+    for index, unit in record_sessions(config, units, sentences) if units else ():
+        unit.save(_note(config, index))
 
 
 def record_unit(config: RecordConfig, index: int) -> None:
@@ -190,7 +213,9 @@ def publish_splits(config: RecordConfig, kind: str, _: int) -> None:
 
 
 def choose_sentences(commands: dict[str, list[str]], unit: Unit, seed: list[int]) -> list[str]:
-    """A random sentence for each of a unit's windows; `seed` identifies the unit."""
+    """A random sentence for each of a unit's windows, unless it has its own; `seed` identifies the unit."""
+    if unit.sentences:
+        return unit.sentences
     rng = np.random.default_rng([*seed, ATTEMPTS])
     return [commands[task][int(rng.integers(len(commands[task])))] for *_, task in unit.windows]
 
@@ -210,6 +235,13 @@ def summary(config: RecordConfig, units: list[Unit]) -> str:
         mean = f"{np.mean(windows):11.1f}" if windows else "          -"
         lines.append(f"{task:28s} {tried[task]:7d}  {accepted[task]:8d}  {len(windows):7d}  {mean}")
     frames = sum(unit.frames for unit in units)
+    if config.mode == "takeovers":
+        alone = sum(sum(unit.alone.values()) for unit in units)
+        demonstrated = sum(unit.demonstrated for unit in units)
+        lines.append(
+            f"{config.policy.path} fulfilled {alone} of {sum(tried.values())} commands by itself, the demonstrator "
+            f"{sum(accepted.values()) - alone} more; it acted in {demonstrated} frames"
+        )
     lines.append(
         f"{frames} frames ({frames / CONTROL_HZ / 3600:.2f} hours), {sum(map(len, lengths.values()))} windows in "
         f"{config.output_dir}"
@@ -217,10 +249,31 @@ def summary(config: RecordConfig, units: list[Unit]) -> str:
     return "\n".join(lines)
 
 
-@draccus.wrap()
-def run(config: RecordConfig) -> None:
-    """Records."""
+def run() -> None:
+    """Records; what the policy is to be changed in is written as in LeRobot's commands: `--policy.NAME=VALUE`."""
+    own, changed = divide_options(sys.argv[1:])
+    config = draccus.parse(RecordConfig, args=own)
+    config.policy.options += changed
     record(config)
+
+
+def divide_options(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """The command's own options, and those of the policy as name=value.
+
+    >>> divide_options(["--policy.path=a", "--policy.n_action_steps=5"])
+    (['--policy.path=a'], ['n_action_steps=5'])
+    """
+    known = tuple(f"--policy.{entry.name}" for entry in fields(TakeoverPolicy))
+    own, changed, arguments = [], [], list(arguments)
+    while arguments:
+        option = arguments.pop(0)
+        if not option.startswith("--policy.") or option.partition("=")[0] in known:
+            own.append(option)
+        elif "=" in option or not arguments:
+            changed.append(option.removeprefix("--policy."))
+        else:
+            changed.append(f"{option.removeprefix('--policy.')}={arguments.pop(0)}")
+    return own, changed
 
 
 def main() -> int:

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from ..calvin import CONTROL_HZ
+from ..calvin import CONTROL_HZ, CONTROL_MODES
 from ..desk import SCENES, DeskError
 from ..jobs.executors import check_executor
 from ..jobs.work import SlurmConfig
@@ -13,7 +13,7 @@ from ..pictures import check_size
 from .skills import SKILLS
 
 SPLITS = ("training", "validation")
-MODES = ("windows", "play", "chains")
+MODES = ("windows", "play", "chains", "takeovers")
 
 
 def group_by_scene(scenes: Sequence[str], count: int) -> list[str]:
@@ -42,6 +42,32 @@ class UnitSlot(NamedTuple):
 
 
 @dataclass
+class TakeoverPolicy:
+    """The policy of `--mode=takeovers`."""
+
+    # A checkpoint: its folder, or its name on the hub.
+    path: str | None = None
+    # Its changed options, name=value; --policy.NAME=VALUE is short for it.
+    options: list[str] = field(default_factory=list)
+    # Filled in: identifies the checkpoint.
+    sha256: str = ""
+
+
+@dataclass
+class TakeoverEnv:
+    """What the policy of `--mode=takeovers` observes, in the environment's terms; pictures are as recorded."""
+
+    # The policy's actions: rel (relative) or abs (absolute).
+    control_mode: str = "rel"
+    # Add 34 numbers to environment_state, 1 for the commanded task and 0 for the others.
+    task_in_state: bool = False
+    # Add the cameras' poses and intrinsics.
+    camera_poses: bool = False
+    # Unit of depth, mm or m; by default that in which LeRobot trained the policy.
+    depth_unit: str | None = None
+
+
+@dataclass
 class RecordConfig:
     """Records demonstrations into OUTPUT_DIR/training and OUTPUT_DIR/validation, in CALVIN's on-disk format."""
 
@@ -50,7 +76,8 @@ class RecordConfig:
     # One scene, or several among which the recording is divided evenly: --scene='[A,B,C]'.
     scene: list[str] | str = "D"
     # windows: one command from a random start per episode; play: tasks follow each other without a reset, and CALVIN's
-    # windows of at most 64 frames are cut from that; chains: play whose windows are whole subtasks.
+    # windows of at most 64 frames are cut from that; chains: play whose windows are whole subtasks; takeovers: chains
+    # in which --policy.path acts, and the demonstrator takes over when it is stuck.
     mode: str = "windows"
     # Tasks to demonstrate, in turn (naming one twice doubles its share); all by default. Windows only.
     tasks: list[str] = field(default_factory=lambda: list(SKILLS))
@@ -59,11 +86,11 @@ class RecordConfig:
     # Accepted demonstrations in the validation split; by default a tenth, and at least one of each task in each scene.
     # Windows only.
     validation_episodes: int | None = None
-    # Hours of play or chains in the training split.
+    # Hours of play, chains or takeovers in the training split.
     hours: float = 1.0
-    # Hours of play or chains in the validation split; a tenth by default.
+    # Hours of play, chains or takeovers in the validation split; a tenth by default.
     validation_hours: float | None = None
-    # Length of a session of play or chains; sessions are divided among the workers.
+    # Length of a session of play, chains or takeovers; sessions are divided among the workers.
     session_minutes: float = 2.0
     # Decides all random choices: the same seed gives the same data for any number of workers.
     seed: int = 0
@@ -81,6 +108,16 @@ class RecordConfig:
     assets: str | None = None
     # What draws the pictures: gl (the look of CALVIN's public data), tiny, pybullet_gl or pybullet_tiny.
     renderer: str = "gl"
+    # The policy that acts. Takeovers only, as the five options below.
+    policy: TakeoverPolicy = field(default_factory=TakeoverPolicy)
+    # What it observes, as in lansar-eval.
+    env: TakeoverEnv = field(default_factory=TakeoverEnv)
+    # The policy is stuck when it takes so many times as long as the demonstrator does on average.
+    patience: float = 1.5
+    # Windows also of the commands that the policy fulfilled by itself.
+    keep_successes: bool = False
+    # Sessions that each worker plays at once, for one batch of the policy.
+    batch_size: int = 8
     # YAML file of sentences by task for the training split, in CALVIN's format; our own by default.
     annotations: str | None = None
     # The same for the validation split.
@@ -129,8 +166,26 @@ class RecordConfig:
         for name, minutes in (("hours", 60), ("validation_hours", 60), ("session_minutes", 1)):
             if not 0.1 <= getattr(self, name) * minutes <= 1e6:
                 raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
+        self._check_takeovers()
         if self.mode != "windows" and self.tasks != list(SKILLS):
             raise DeskError(f"--tasks goes with --mode=windows; --mode={self.mode} carries out whatever is feasible")
+
+    def _check_takeovers(self) -> None:
+        if self.mode != "takeovers":
+            changed = [name for name, usual in _TAKEOVER_OPTIONS.items() if getattr(self, name) != usual]
+            if changed:
+                raise DeskError(f"--{changed[0]} goes with --mode=takeovers, not --mode={self.mode}")
+            return
+        if not self.policy.path:
+            raise DeskError("--mode=takeovers needs the policy that acts: --policy.path=FOLDER, or a name on the hub")
+        if self.env.control_mode not in CONTROL_MODES:
+            raise DeskError(f"--env.control_mode is {' or '.join(CONTROL_MODES)}, got {self.env.control_mode!r}")
+        if self.env.depth_unit not in (None, "m", "mm"):
+            raise DeskError(f"--env.depth_unit is m or mm, got {self.env.depth_unit!r}")
+        if not 0 < self.patience <= 10:
+            raise DeskError(f"--patience lies between 0 and 10, got {self.patience}")
+        if self.batch_size < 1:
+            raise DeskError(f"--batch_size must be at least 1, got {self.batch_size}")
 
     @property
     def scenes(self) -> list[str]:
@@ -139,13 +194,18 @@ class RecordConfig:
 
     def request(self) -> dict[str, object]:
         """The options that decide what the recorded data are: all but where they go and where the work runs."""
-        without = {"output_dir", "workers", "executor", "slurm"}
+        without = {"output_dir", "workers", "executor", "slurm", "batch_size"}
         without |= (
             {"hours", "validation_hours", "session_minutes"}
             if self.mode == "windows"
             else {"tasks", "episodes", "validation_episodes"}
         )
-        return {k: v for k, v in asdict(self).items() if k not in without}
+        if self.mode != "takeovers":
+            without |= set(_TAKEOVER_OPTIONS)
+        request = {k: v for k, v in asdict(self).items() if k not in without}
+        if self.mode == "takeovers":
+            del request["policy"]["path"]  # the same checkpoint elsewhere is the same
+        return request
 
     def counts(self) -> tuple[int, int]:
         """How many units the training and the validation split have: episodes, or sessions of play."""
@@ -164,6 +224,8 @@ class RecordConfig:
 
     def shard_size(self) -> int:
         """Units that one shard of work records; decided by the request alone."""
+        if self.mode == "takeovers":
+            return self.batch_size
         return max(4, sum(self.counts()) // 500) if self.mode == "windows" else 1
 
     def annotations_of(self, split: str) -> str | None:
@@ -177,3 +239,13 @@ class RecordConfig:
         number = index if index < training else index - training
         scenes = group_by_scene(self.scenes, count)
         return UnitSlot(split, number, scenes[number], number - scenes.index(scenes[number]))
+
+
+_TAKEOVER_OPTIONS = {
+    "policy": TakeoverPolicy(),
+    "env": TakeoverEnv(),
+    "patience": RecordConfig.patience,
+    "keep_successes": RecordConfig.keep_successes,
+    "batch_size": RecordConfig.batch_size,
+}
+"""Options that only --mode=takeovers has, with their defaults."""

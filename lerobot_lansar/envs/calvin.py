@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from ..benchmark import LH_MTLC, load_chains
-from ..calvin import CAMERAS, CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS, continuous_euler
+from ..calvin import CAMERAS, CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS
 from ..desk import Desk, DeskError, Observation, SimulationError, Snapshot, is_fulfilled
 from ..desk.render import RENDERERS
 from ..desk.scenes import get_scene
@@ -21,7 +21,7 @@ from ..pictures import check_size
 from .control_mode import refuse_other_mode
 from .episodes import append_episode
 from .pictures import Pictures
-from .spaces import ACTION_SIZE, action_space, observation_space
+from .spaces import ACTION_SIZE, action_space, observation_space, observe
 
 # With an episode's seed: generators apart from the one that draws its start.
 _PERTURBATION_STREAM = (4, 9)
@@ -278,7 +278,7 @@ class CalvinEnv(gym.Env):
         sentences = self._sentences[self._current]
         chosen = int(self._choices.integers(len(sentences))) if self.sentence == "random" else 0
         self.task_description = sentences[chosen]
-        self._task_one_hot = np.array([task == self._current for task in TASKS], dtype=np.float64)
+        self._observed_task = self._current
 
     def _judge(self) -> tuple[bool, bool]:
         """Whether the last step fulfilled the command, and whether it ended the episode; notes how a command ended."""
@@ -306,16 +306,9 @@ class CalvinEnv(gym.Env):
         return action
 
     def _observation(self) -> dict[str, Any]:
-        state, robot = self._last["scene_obs"], self._last["robot_obs"].copy()
-        robot[3:6] = continuous_euler(robot[3:6])
         if "rgb_static" in self._last and self._render_size == CAMERAS["static"]:
             self._picture = (self._steps, self._last["rgb_static"])
-        return {
-            "agent_pos": robot,
-            "environment_state": np.concatenate([state, self._task_one_hot]) if self.task_in_state else state,
-            "control_mode": np.array([CONTROL_MODES.index(self.control_mode)], dtype=np.float32),
-            **self.pictures.observe(self._last),
-        }
+        return observe(self._last, self.pictures, self.control_mode, self._observed_task, self.task_in_state)
 
     def _info(self) -> dict[str, Any]:
         successes = self._successes()

@@ -42,7 +42,9 @@ def refuse_recording(mixed: bool, depth: bool) -> None:
         raise CommandError("--eval.recording=true cannot store depth: leave out --env.depth, or use lansar-record")
 
 
-def check_policy(task_in_state: bool, pictures: Pictures) -> None:
+def check_policy(
+    task_in_state: bool, pictures: Pictures, trained: dict[str, tuple[int, ...]] | None = None, option: str = "--env."
+) -> None:
     """Compares the environment's observations with what the command's policy was trained on.
 
     A policy that gets another number of inputs would end with "mat1 and mat2 shapes cannot be multiplied", one that
@@ -52,14 +54,16 @@ def check_policy(task_in_state: bool, pictures: Pictures) -> None:
     Args:
         task_in_state: The environment's option.
         pictures: Its pictures.
+        trained: The shapes of what the policy reads, by key; None: those of the command's policy.
+        option: What the names of options about pictures begin with.
 
     Raises:
         CommandError: `environment_state` differs by the task's 34 numbers; pictures have another size; the policy reads
             depth and there is none.
     """
-    shapes = _trained_shapes()
+    shapes = _trained_shapes() if trained is None else trained
     _check_environment_state(task_in_state, shapes)
-    _check_pictures(pictures, shapes)
+    _check_pictures(pictures, shapes, option)
 
 
 def _check_environment_state(task_in_state: bool, shapes: dict[str, tuple[int, ...]]) -> None:
@@ -71,16 +75,16 @@ def _check_environment_state(task_in_state: bool, shapes: dict[str, tuple[int, .
         )
 
 
-def _check_pictures(pictures: Pictures, trained: dict[str, tuple[int, ...]]) -> None:
+def _check_pictures(pictures: Pictures, trained: dict[str, tuple[int, ...]], option: str) -> None:
     for camera in pictures.cameras:
         key, size = f"{OBS_IMAGES}.{camera}", pictures.size(camera)
         if f"{key}_depth" in trained and not pictures.depth:
-            raise CommandError(f"the policy was trained on {key}_depth: set --env.depth=true")
+            raise CommandError(f"the policy was trained on {key}_depth: set {option}depth=true")
         if key in trained and trained[key][1] != size:
             own = 0 if trained[key][1] == CAMERAS[camera] else trained[key][1]
             raise CommandError(
                 f"the policy was trained on pictures of {trained[key][1]} pixels in {key}, but the environment's have "
-                f"{size}: set --env.image_size={own}"
+                f"{size}: set {option}image_size={own}"
             )
 
 

@@ -1,9 +1,20 @@
 """Observation and action spaces of `CalvinEnv`."""
 
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
 
-from ..calvin import ACTION_NAMES, HOME_EULER, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
+from ..calvin import (
+    ACTION_NAMES,
+    CONTROL_MODES,
+    HOME_EULER,
+    ROBOT_OBS_NAMES,
+    SCENE_OBS_NAMES,
+    TASKS,
+    continuous_euler,
+)
+from ..desk import Observation
 from .pictures import Pictures
 
 ACTION_SIZE = len(ACTION_NAMES["rel"])
@@ -28,6 +39,20 @@ def observation_space(pictures: Pictures, task_in_state: bool) -> spaces.Dict:
     }
     entries["control_mode"] = spaces.Box(0, 1, (1,), np.float32)
     return spaces.Dict({**entries, **pictures.spaces()})
+
+
+def observe(obs: Observation, pictures: Pictures, control_mode: str, task: str, task_in_state: bool) -> dict[str, Any]:
+    """What a policy is given of one of the desk's observations, as `CalvinEnv` describes it; in `observation_space`."""
+    state, robot = obs["scene_obs"], obs["robot_obs"].copy()
+    robot[3:6] = continuous_euler(robot[3:6])
+    if task_in_state:
+        state = np.concatenate([state, [float(name == task) for name in TASKS]])
+    return {
+        "agent_pos": robot,
+        "environment_state": state,
+        "control_mode": np.array([CONTROL_MODES.index(control_mode)], dtype=np.float32),
+        **pictures.observe(obs),
+    }
 
 
 def action_space(control_mode: str) -> spaces.Box:

@@ -2,17 +2,29 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor, nn
 
 from ..command import CommandError
-from .stream import EpisodeStream
+from .stream import Episode
 
 LEAST_ROWS = 4
 """LanSAR's actions do not depend on the size of its batch, not even in rounding, from so many rows on."""
+
+
+class Stream(Protocol):
+    """An environment of the batch: an `EpisodeStream`, or a session of `lansar-record --mode=takeovers`.
+
+    Attributes:
+        episode: The one being played, or None when there is none left.
+        commands: How many commands have begun, in all episodes.
+    """
+
+    episode: Episode | None
+    commands: int
 
 
 class ResetAtCommands(nn.Module):
@@ -27,7 +39,7 @@ class ResetAtCommands(nn.Module):
         streams: The environments of the batch, in order.
     """
 
-    def __init__(self, policy: PreTrainedPolicy, streams: Sequence[EpisodeStream]):
+    def __init__(self, policy: PreTrainedPolicy, streams: Sequence[Stream]):
         super().__init__()
         policy.reset()
         self._policy, self._streams = policy, streams
@@ -67,11 +79,11 @@ class _Copy:
         device = torch.device(policy.config.device or "cpu")
         self._devices = [device] if device.type == "cuda" else []
         self._playing: Any = None
-        self._stream: EpisodeStream | None = None
+        self._stream: Stream | None = None
         self._random: list[Tensor] = []
         self._last: Tensor | None = None
 
-    def begin(self, stream: EpisodeStream) -> None:
+    def begin(self, stream: Stream) -> None:
         """Begins a command, which may be an episode's first."""
         self._policy.reset()
         self._stream = stream
@@ -108,7 +120,7 @@ def _rows(batch: dict[str, Any], rows: list[int], environments: int) -> dict[str
             if len(value) != environments:
                 raise CommandError(
                     f"the policy's {key} is {tuple(value.shape)} for {environments} environments and cannot be divided "
-                    "among them: give --eval.batch_size=1"
+                    "among them: give --eval.batch_size=1 (lansar-record: --batch_size=1)"
                 )
             chosen[key] = value[rows]
         elif isinstance(value, list) and len(value) == environments:
