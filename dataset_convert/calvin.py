@@ -94,10 +94,10 @@ class CalvinSplit:
 
         Args:
             frames: n frame numbers.
-            keys: Names out of `VECTORS`, `RGB`, `DEPTH` and `TACTILE`.
+            keys: Names out of `VECTORS`, `RGB`, `DEPTH`, `TACTILE` and `INTERVENTION`.
 
         Returns:
-            For each key an array of shape (n, ...) in the file's floating dtype, or uint8 for colours.
+            For each key an array of shape (n, ...) in the file's floating dtype, uint8 for colours, or bool.
 
         Raises:
             FileNotFoundError: A frame's file is missing.

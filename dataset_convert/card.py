@@ -10,7 +10,7 @@ import numpy as np
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name
 from dataset_convert.poses import GRIPPER_POSE
 from lerobot_lansar.calvin import CAMERAS, COLORS
-from lerobot_lansar.datasets import MANIFEST
+from lerobot_lansar.datasets import INTERVENTION_FEATURE, MANIFEST
 
 _REL = "pose difference to the TCP's in units of (0.02 m, 0.05 rad), clipped to ±1; gripper −1 close, +1 open"
 _ABS = "TCP position (m) and euler angles (rad) in the world frame; gripper −1 close, +1 open"
@@ -25,6 +25,7 @@ _MEANING = {
     "calvin.window": "annotated window that the frame belongs to (its place in the language file), −1 for none",
     "calvin.task": f"CALVIN task, a place in `task_names` of `{MANIFEST}`, −1 for none",
     "calvin.scene": f"scene, a place in `scene_names` of `{MANIFEST}`",
+    INTERVENTION_FEATURE: "who acted: true for the demonstrator, false for a policy",
     "observation.images.static": "fixed camera",
     "observation.images.gripper": "camera in the hand",
     "observation.images.static_depth": "distances (m) of the fixed camera",

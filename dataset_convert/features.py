@@ -24,6 +24,7 @@ from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder
 from dataset_convert.poses import pose_features
 from dataset_convert.stats import Stats
 from lerobot_lansar.calvin import ACTION_NAMES, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
+from lerobot_lansar.datasets import INTERVENTION_FEATURE
 
 _TASK_NAMES = [f"task_{task}" for task in TASKS]
 _NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
@@ -100,7 +101,11 @@ def _depth_codec() -> Codec:
 
 
 def dataset_features(
-    action: str, pictures: tuple[Picture, ...], task_in_state: bool = False, camera_poses: bool = False
+    action: str,
+    pictures: tuple[Picture, ...],
+    task_in_state: bool = False,
+    camera_poses: bool = False,
+    interventions: bool = False,
 ) -> dict[str, dict]:
     """LeRobot's description of the dataset's columns.
 
@@ -110,6 +115,7 @@ def dataset_features(
         pictures: Camera features.
         task_in_state: The scene's state also says which task is commanded.
         camera_poses: The cameras' poses and intrinsics are observations too.
+        interventions: A column says who acted.
 
     Returns:
         Feature name to {"dtype", "shape", "names"}, LeRobot's own columns (`index`, ...) included.
@@ -121,6 +127,7 @@ def dataset_features(
         "action": _vector(ACTION_NAMES[action]),
         other: _vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
+        **({INTERVENTION_FEATURE: {"dtype": "bool", "shape": (1,), "names": None}} if interventions else {}),
         **{key: _matrix(numbers) for key, numbers in pose_features(bool(pictures), camera_poses).items()},
     }
     for picture in pictures:
@@ -145,10 +152,12 @@ def _matrix(numbers: int) -> dict:
     return _vector(f"row_{row}_column_{column}" for row in range(side) for column in range(side))
 
 
-def empty_info(action: str, pictures: tuple[Picture, ...], task_in_state: bool, camera_poses: bool) -> DatasetInfo:
+def empty_info(
+    action: str, pictures: tuple[Picture, ...], task_in_state: bool, camera_poses: bool, interventions: bool
+) -> DatasetInfo:
     """The dataset's description before anything is written."""
     has_videos = any(picture.codec for picture in pictures)
-    features = dataset_features(action, pictures, task_in_state, camera_poses)
+    features = dataset_features(action, pictures, task_in_state, camera_poses, interventions)
     return create_empty_dataset_info(CODEBASE_VERSION, CONTROL_HZ, features, has_videos, "panda")
 
 

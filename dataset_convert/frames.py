@@ -12,6 +12,7 @@ import numpy as np
 
 from dataset_convert.safe_pickle import parse_npy
 from lerobot_lansar.calvin import CAMERAS
+from lerobot_lansar.datasets import IS_INTERVENTION
 
 VECTORS = {"robot_obs": (15,), "scene_obs": (24,), "actions": (7,), "rel_actions": (7,)}
 """Shapes of the float vectors stored in every frame file."""
@@ -27,6 +28,9 @@ DEPTH = {f"depth_{camera}": (size, size) for camera, size in CAMERAS.items()}
 
 TACTILE = {"rgb_tactile": (160, 120, 6), "depth_tactile": (160, 120, 2)}
 """Shapes of the pictures of the two fingertip sensors side by side: uint8 colours, floating-point depth."""
+
+INTERVENTION = {IS_INTERVENTION: (1,)}
+"""Shape of the truth value that says who acted, in recordings of takeovers."""
 
 _MAX_BYTES = 1 << 20
 """Limit for one array; the largest of a frame takes less than half of it."""
@@ -51,6 +55,17 @@ def frame_numbers(folder: Path) -> np.ndarray:
     return np.sort(np.array([number for number in numbers if number.isdecimal()], dtype=np.int64))
 
 
+def records_interventions(files: Iterable[Path]) -> bool:
+    """Whether a recording's frames say who acted, as the first readable one of these files does or does not."""
+    for file in files:
+        try:
+            with zipfile.ZipFile(file) as stored:
+                return f"{IS_INTERVENTION}.npy" in stored.NameToInfo
+        except (OSError, zipfile.BadZipFile):  # reported when all frames are read
+            continue
+    return False
+
+
 def shape_of(array: str, image_size: int = 0) -> tuple[int, ...]:
     """The shape of one of CALVIN's arrays.
 
@@ -60,7 +75,7 @@ def shape_of(array: str, image_size: int = 0) -> tuple[int, ...]:
     """
     if image_size and array in RGB | DEPTH:
         return (image_size, image_size, *(RGB | DEPTH)[array][2:])
-    return (VECTORS | RGB | DEPTH | TACTILE)[array]
+    return (VECTORS | RGB | DEPTH | TACTILE | INTERVENTION)[array]
 
 
 def read_frame(path: Path, keys: Iterable[str], image_size: int = 0) -> dict[str, np.ndarray]:
@@ -115,8 +130,9 @@ def _read_member(stored: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 def _checked(array: np.ndarray, key: str, path: Path, image_size: int) -> np.ndarray:
     shape, is_color = shape_of(key, image_size), key.startswith("rgb_")
-    is_right_kind = array.dtype == np.uint8 if is_color else array.dtype.kind == "f"
+    kind = "bool" if key in INTERVENTION else "uint8" if is_color else "float"
+    is_right_kind = array.dtype.kind == "f" if kind == "float" else array.dtype == kind
     if array.shape != shape or not is_right_kind:
-        wanted = f"{'uint8' if is_color else 'float'} {shape}"
+        wanted = f"{kind} {shape}"
         raise ValueError(f"{path}: array {key!r} is {array.dtype} {array.shape}, expected {wanted}")
     return array

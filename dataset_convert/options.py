@@ -54,6 +54,9 @@ class ConvertConfig:
     # Tell policies that read no language which task is commanded: 34 more numbers in observation.environment_state,
     # 1 for the commanded task and 0 for the others.
     task_in_state: bool = False
+    # Write complementary_info.is_intervention, who acted, although the frames do not say it: the demonstrator always.
+    # Recordings of takeovers say it and always have it, and LeRobot merges datasets only if all or none do.
+    is_intervention: bool = False
     # How both cameras are stored: video, png (in the parquet files) or none.
     images: str = "video"
     # Width and height of both cameras' pictures and depth, as in --env.image_size; 0: 200 and 84, the cameras' own.
@@ -139,6 +142,7 @@ class ConvertConfig:
             name: getattr(self, name)
             for name, usual in (
                 ("task_in_state", False),
+                ("is_intervention", False),
                 ("scene", ""),
                 ("image_size", 0),
                 ("camera_poses", False),

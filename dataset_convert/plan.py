@@ -18,7 +18,7 @@ from dataset_convert.episodes import (
     window_of_frames,
     window_spans,
 )
-from dataset_convert.frames import RGB, VECTORS
+from dataset_convert.frames import RGB, records_interventions
 from dataset_convert.language import read_embeddings
 from dataset_convert.options import ConvertConfig
 from dataset_convert.poses import describe_cameras
@@ -62,7 +62,10 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
 
     size = _image_size(config, split)
     pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder, size)
-    info = features.empty_info(config.action, pictures, config.task_in_state, config.camera_poses)
+    recorded = records_interventions(split.frame_file(span.start) for span in spans)
+    info = features.empty_info(
+        config.action, pictures, config.task_in_state, config.camera_poses, recorded or config.is_intervention
+    )
     job = Job(
         split=split,
         folder=staging_of(config.target),
@@ -77,6 +80,7 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
         scene_names=[*SCENE_NAMES, *sorted(set(scenes) - set(SCENE_NAMES))],
         skip_bad=config.skip_bad,
         camera_poses=config.camera_poses,
+        interventions="recorded" if recorded else "all" if config.is_intervention else "",
         also_checked=tuple(RGB) if config.embed else (),
         validation=None if config.exclude_shared else validation,
     )
@@ -221,7 +225,7 @@ def _check_recorded(job: Job) -> None:
     Raises:
         FileNotFoundError, ValueError: It cannot be read; with `skip_bad`, no episode's first frame can.
     """
-    arrays = [*VECTORS, *job.arrays()]
+    arrays = [*job.numbers(), *job.arrays()]
     first_error: Exception | None = None
     for span in job.spans:
         try:

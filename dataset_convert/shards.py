@@ -13,13 +13,14 @@ import pyarrow.parquet as pq
 from dataset_convert import blocks, checks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
-from dataset_convert.frames import STATES, VECTORS, digest
+from dataset_convert.frames import INTERVENTION, STATES, VECTORS, digest
 from dataset_convert.layout import Layout
 from dataset_convert.poses import pose_columns
 from dataset_convert.shared import ValidationStates, key_of
 from dataset_convert.writer import FrameBatch, ShardPosition, Written, write_shard
 from lerobot_lansar.calvin import TASKS, continuous_euler
 from lerobot_lansar.clip.store import sha256
+from lerobot_lansar.datasets import INTERVENTION_FEATURE, IS_INTERVENTION
 from lerobot_lansar.jobs.staging import write_atomically
 
 DATASET, SHARDS = "dataset", "shards"
@@ -46,6 +47,7 @@ class Job:
         task_names, scene_names: What the numbers in `calvin.task` and `calvin.scene` mean.
         skip_bad: Leave defective episodes out instead of stopping.
         camera_poses: The cameras' poses and intrinsics are observations too.
+        interventions: Who acted: `"recorded"` in the frames, `"all"` frames the demonstrator, `""` not said.
         also_checked: CALVIN's picture arrays that must be readable too, although the dataset may not hold them.
         validation: States by which frames that are in validation too are noted; None: they are not looked for.
     """
@@ -63,6 +65,7 @@ class Job:
     scene_names: list[str]
     skip_bad: bool
     camera_poses: bool = False
+    interventions: str = ""
     also_checked: tuple[str, ...] = ()
     validation: ValidationStates | None = None
 
@@ -78,6 +81,10 @@ class Job:
     def note(self, shard: int) -> Path:
         """The file that says that a shard is finished, and how; the table of its episodes is beside it."""
         return self.folder / SHARDS / f"{shard:06d}.json"
+
+    def numbers(self) -> list[str]:
+        """CALVIN's arrays that are needed, but pictures."""
+        return [*VECTORS, *(INTERVENTION if self.interventions == "recorded" else ())]
 
     def arrays(self) -> list[str]:
         """CALVIN's picture arrays that are needed."""
@@ -268,7 +275,7 @@ def _observed(job: Job, number: int, progress: _Progress, seen: Seen) -> Iterato
     """An episode's batches; what they show of the source is added to `seen`."""
     state = None
     for batch, arrays in _read_batches(job, number, with_pictures=True):
-        state = digest({key: arrays[key] for key in (*VECTORS, *job.stored_arrays())}, state)
+        state = digest({key: arrays[key] for key in (*job.numbers(), *job.stored_arrays())}, state)
         if job.validation is not None:
             keys = np.array([key_of(*rows) for rows in zip(*(arrays[key] for key in STATES), strict=True)], np.uint64)
             seen.shared.update(job.validation.among(job.split.folder, batch.columns["calvin.frame"], keys))
@@ -286,7 +293,7 @@ def _read_batches(job: Job, number: int, with_pictures: bool) -> Iterator[tuple[
     """
     span = job.spans[number]
     windows = window_of_frames(span, job.split.windows)
-    keys = [*VECTORS, *(job.arrays() if with_pictures else [])]
+    keys = [*job.numbers(), *(job.arrays() if with_pictures else [])]
     for start in range(span.start, span.end, BATCH_FRAMES):
         frames = range(start, min(start + BATCH_FRAMES, span.end))
         try:
@@ -331,6 +338,9 @@ def to_batch(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: d
         "calvin.task": tasks,
         "calvin.scene": np.full(len(frames), job.scene_names.index(span.scene)),
     }
+    if job.interventions:
+        acted = arrays[IS_INTERVENTION][:, 0] if job.interventions == "recorded" else np.ones(len(frames), bool)
+        columns[INTERVENTION_FEATURE] = acted
     sentences = np.array([sentence_of[w] for w in numbers])
     return FrameBatch(columns, sentences, {key: arrays[key] for key in job.stored_arrays() if key in arrays})
 

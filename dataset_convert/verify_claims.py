@@ -13,13 +13,13 @@ from tqdm import tqdm
 from dataset_convert import blocks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import NO_COMMAND, Span, as_ranges, play_spans, window_of_frames, window_spans
-from dataset_convert.frames import DEPTH, RGB, TACTILE, shape_of
+from dataset_convert.frames import DEPTH, RGB, TACTILE, records_interventions, shape_of
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name, read_embeddings
 from dataset_convert.layout import check_format
 from dataset_convert.verify_shared import ValidationFrames
 from lerobot_lansar.calvin import CAMERAS, CONTROL_HZ, SCENE_NAMES, TASKS
 from lerobot_lansar.clip.store import dataset_fingerprint, sha256
-from lerobot_lansar.datasets import MANIFEST
+from lerobot_lansar.datasets import INTERVENTION_FEATURE, MANIFEST
 
 
 class Mismatch(Exception):
@@ -72,6 +72,7 @@ class Dataset:
             if found := blocks.contradictions(scene, evidence):
                 self.contradictions[scene] = found
             self.orders[scene] = blocks.block_order(scene, evidence.votes, request.get("block_order", "checked"))
+        self.says_who_acted = records_interventions(self.split.frame_file(span.start) for span in self.spans)
         found_in = ValidationFrames(root) if request["split"] == "training" else None
         self.validation = found_in if found_in else None
 
@@ -124,6 +125,7 @@ def check_claims(dataset: Dataset) -> list[str]:
     _check_shared(dataset)
     _check_spans(dataset)
     _check_pictures(dataset)
+    _check_interventions(dataset)
     _check_episodes(dataset)
     _check_lang(dataset)
     return _check_clip(dataset)
@@ -256,6 +258,13 @@ def _check_pictures(dataset: Dataset) -> None:
         if (feature["shape"], feature["names"]) != wanted:
             told = f"{feature['shape']} {feature['names']}"
             raise Mismatch(f"{dataset.folder}/meta/info.json: {key} is {told}, expected {wanted[0]} {wanted[1]}")
+
+
+def _check_interventions(dataset: Dataset) -> None:
+    """There is a column that says who acted if the source says it or it was asked for, and only then."""
+    wanted = dataset.says_who_acted or dataset.manifest["request"].get("is_intervention", False)
+    if (INTERVENTION_FEATURE in dataset.features) != wanted:
+        raise Mismatch(f"{dataset.folder}/meta/info.json: {INTERVENTION_FEATURE} is {'missing' if wanted else 'there'}")
 
 
 def _check_episodes(dataset: Dataset) -> None:

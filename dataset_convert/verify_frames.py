@@ -16,10 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from dataset_convert.frames import STATES, VECTORS, digest
+from dataset_convert.frames import INTERVENTION, STATES, VECTORS, digest
 from dataset_convert.verify_cameras import camera_matrices
 from dataset_convert.verify_claims import Dataset, Mismatch, chunk_and_file
 from lerobot_lansar.calvin import COLORS, CONTROL_HZ, TASKS
+from lerobot_lansar.datasets import INTERVENTION_FEATURE, IS_INTERVENTION
 from lerobot_lansar.pictures import resize
 
 _BETTER = 0.9
@@ -100,7 +101,8 @@ def verify_file(dataset: Dataset, path: Path, min_psnr: float) -> Found:
         for key, feature in cameras.items()
         if feature["dtype"] == "video"
     }
-    arrays = [*VECTORS, *dict.fromkeys(dataset.source_of(key)[0] for key in cameras)]
+    numbers = [*VECTORS, *(INTERVENTION if dataset.says_who_acted else ())]
+    arrays = [*numbers, *dict.fromkeys(dataset.source_of(key)[0] for key in cameras)]
     found = Found()
     hashes: dict[int, Any] = {}
     with pq.ParquetFile(path) as table:
@@ -178,6 +180,7 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
     scene = source["scene_obs"][:, [*range(6), *blocks]]
     if manifest["request"].get("task_in_state"):
         scene = np.hstack([scene, np.eye(len(TASKS) + 1)[tasks, :-1]])  # task -1 takes the last row: all zeros
+    acted = source[IS_INTERVENTION][:, 0] if dataset.says_who_acted else np.full(n, True)
     number = {row["task"]: row["task_index"] for row in dataset.tasks}
     return {
         "observation.state": _without_jumps(source["robot_obs"]).astype(np.float32),
@@ -188,6 +191,7 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
         "calvin.window": windows,
         "calvin.task": tasks,
         "calvin.scene": np.full(n, manifest["scene_names"].index(span.scene)),
+        **({INTERVENTION_FEATURE: acted} if INTERVENTION_FEATURE in dataset.features else {}),
         "timestamp": (np.arange(first, first + n) / CONTROL_HZ).astype(np.float32),
         "frame_index": np.arange(first, first + n),
         "episode_index": np.full(n, episode),

@@ -5,6 +5,12 @@ from pathlib import Path
 
 from huggingface_hub.constants import HF_HOME
 
+IS_INTERVENTION = "is_intervention"
+"""CALVIN's frames of takeovers say with this array who acted, (1,) bool: True for the demonstrator, False for a policy.
+LeRobot's name for it (`TeleopEvents.IS_INTERVENTION`)."""
+INTERVENTION_FEATURE = f"complementary_info.{IS_INTERVENTION}"
+"""The dataset's column of it, named as LeRobot names the complementary information of a transition."""
+
 MANIFEST = "meta/calvin_source.json"
 """File in which `lansar-convert` says what a dataset was made from."""
 

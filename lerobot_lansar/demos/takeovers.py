@@ -25,6 +25,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from ..calvin import CHAIN_LENGTH, POSE_UNITS, STEPS_PER_COMMAND, TASKS, TCP_POSE, relative_action
 from ..command import CommandError
+from ..datasets import IS_INTERVENTION
 from ..desk import Desk, DeskError, SimulationError, is_fulfilled
 from ..desk.desk import Observation
 from ..desk.oracle import Snapshot
@@ -44,10 +45,6 @@ from .play import choose_task, feasible_tasks, stay, whole_windows
 from .record_config import RecordConfig
 from .skills import SKILLS
 from .stuck import Watch
-
-INTERVENTION = "is_intervention"
-"""A frame's array that says who acted, (1,) bool: True for the demonstrator. LeRobot's name for it."""
-
 
 # ---- the policy
 
@@ -331,7 +328,7 @@ class Session:
 
     def _add(self, frame: Frame, demonstrated: bool, after: Observation, now: Snapshot) -> None:
         """Records a frame, whose state is the present one, and goes on to the state after it."""
-        self._writer.add({**frame, INTERVENTION: np.array([demonstrated])})
+        self._writer.add({**frame, IS_INTERVENTION: np.array([demonstrated])})
         self._snapshots.append(self._last)
         self._acted.append(demonstrated)
         self._unit.demonstrated += int(demonstrated)
