@@ -214,7 +214,7 @@ def _numbers(column: Any) -> np.ndarray:
     """A column as (n,) or (n, length)."""
     flat = column.combine_chunks()
     if not hasattr(flat, "flatten") or not hasattr(flat.type, "list_size"):
-        return flat.to_numpy()
+        return flat.to_numpy(zero_copy_only=False)
     return flat.flatten().to_numpy().reshape(len(flat), -1)
 
 

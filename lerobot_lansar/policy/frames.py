@@ -16,6 +16,7 @@ from lerobot.datasets.io_utils import load_tasks
 from tqdm import tqdm
 
 from ..clip.store import data_files, dataset_fingerprint
+from ..datasets import INTERVENTION_FEATURE
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM
 
 CACHE = ".cache/huggingface/lansar_frames"
@@ -33,12 +34,17 @@ TASK_COLUMN = "calvin.task"
 """The column with the number of each frame's CALVIN task, -1 for none."""
 
 
+OPTIONAL = {"is_intervention": INTERVENTION_FEATURE}
+"""Array to the dataset's column, with one truth value per frame; without the column there is no array."""
+
+
 def read_frames(root: Path) -> dict[str, np.ndarray]:
     """Reads every frame's numbers from the parquet files, sorted by `index`.
 
     Returns:
         Index (T,) int64; state (T, 15), environment_state (T, 24), action (T, 7) float32; first and end (T,) int64,
-        the rows where the frame's episode begins and ends (end exclusive).
+        the rows where the frame's episode begins and ends (end exclusive); is_intervention (T,) bool, whether the
+        demonstrator acted, if the dataset has that column.
 
     Raises:
         ValueError: A missing column, a wrong width, NaN or infinity, an index that occurs twice, or an episode with
@@ -89,6 +95,9 @@ def _read_file(path: Path) -> dict[str, np.ndarray]:
                 f"(index {frames['index'][row]}). Remove the episode or convert the dataset again."
             )
         frames[name] = values
+    for name, column in OPTIONAL.items():
+        if column in present:
+            frames[name] = pq.read_table(path, columns=[column])[column].to_numpy().astype(bool)
     return frames
 
 
@@ -113,7 +122,7 @@ def load_frames(root: Path) -> dict[str, np.ndarray]:
             if not cache.is_dir():  # not there either because another process was faster
                 logging.warning(f"Cannot keep LanSAR's frame arrays in {cache} ({error.strerror}).")
                 return frames
-    names = ("index", *COLUMNS, "first", "end")
+    names = ["index", *COLUMNS, "first", "end", *(name for name in OPTIONAL if (cache / f"{name}.npy").exists())]
     return {name: np.load(cache / f"{name}.npy", mmap_mode="r") for name in names}
 
 

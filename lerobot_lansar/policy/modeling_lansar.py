@@ -21,7 +21,7 @@ from .configuration_lansar import LanSARConfig
 from .losses import Losses
 from .network import LanSARNetwork
 from .optimizer import parameter_groups
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, START, VALID_STEPS
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, COUNTS, START, VALID_STEPS
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
 from .windows import Windows, set_current
 
@@ -108,7 +108,7 @@ class LanSARPolicy(PreTrainedPolicy):
             self.scaler.fit(
                 torch.tensor(windows.frames["state"]),
                 torch.tensor(environment_state),
-                torch.tensor(windows.targets[windows.has_target, :6]),
+                torch.tensor(windows.targets[windows.has_target & windows.is_demonstrated, :6]),
                 torch.tensor(environment_state[windows.frames["first"]]) if config.since_command else None,
             )
             set_current(windows)
@@ -164,13 +164,13 @@ class LanSARPolicy(PreTrainedPolicy):
 
         Args:
             batch: From the preprocessor, see `processor_lansar.py`.
-            reduction: "mean": the average over all valid steps. "none", for LeRobot's `--sample_weighting`: one loss
-                per window, whose average is the loss with "mean". A window's steps are therefore summed and divided by
-                the mean number of steps per window. The contrastive loss, which belongs to the whole batch, is added
-                to each.
+            reduction: "mean": the average over all valid steps in which the demonstrator acted. "none", for LeRobot's
+                `--sample_weighting`: one loss per window, whose average is the loss with "mean". A window's steps are
+                therefore summed and divided by the mean number of steps per window. The contrastive loss, which
+                belongs to the whole batch, is added to each.
 
         Returns:
-            The loss, () or (B,); its terms, averaged over all valid steps.
+            The loss, () or (B,); its terms, averaged over the same steps.
 
         Raises:
             ValueError: The batch holds no windows, or `reduction` is neither.
@@ -183,6 +183,11 @@ class LanSARPolicy(PreTrainedPolicy):
         mixed = self.config.dtype == "bfloat16"
         with torch.autocast(batch[OBS_STATE].device.type, torch.bfloat16) if mixed else nullcontext():
             terms, contrast = self._loss_terms(batch)
+        if COUNTS in batch:
+            # What counts, in units of its mean: every mean below is then one over the steps that count.
+            counts = batch[COUNTS].flatten()[batch[VALID_STEPS]]
+            counts = counts * len(counts) / counts.sum().clamp(min=1)
+            terms = {name: values * counts for name, values in terms.items()}
         steps = torch.stack(list(terms.values())).sum(dim=0)  # (N,)
         terms = {name: values.mean() for name, values in terms.items()}
         if reduction == "none":

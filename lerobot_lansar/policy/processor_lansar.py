@@ -21,6 +21,7 @@ and in training only:
     start_environment_state        (B, 1, 24) when the command began; with `since_command`
     action                         (B, n, 7), the targets
     valid_steps                    (N,) which of the B * n steps are not padding
+    counts                         (B, n) 1 where the demonstrator acted, 0 where a policy did; missing without such
     command_tasks                  (B, tasks) 1 for the tasks that a command can mean; for the contrastive loss
 """
 
@@ -51,6 +52,7 @@ CLIP_IMAGE = {"static": "observation.clip.static", "gripper": "observation.clip.
 
 VALID_STEPS = "valid_steps"
 START = "start_environment_state"
+COUNTS = "counts"
 COMMAND_TASKS = "command_tasks"
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -95,6 +97,8 @@ class WindowStep(ProcessorStep):
         }
         if "start" in window:
             new[TransitionKey.COMPLEMENTARY_DATA][START] = window["start"]
+        if "counts" in window:
+            new[TransitionKey.COMPLEMENTARY_DATA][COUNTS] = window["counts"]
         if (command_tasks := self.windows.command_tasks(extra["task"])) is not None:
             new[TransitionKey.COMPLEMENTARY_DATA][COMMAND_TASKS] = command_tasks
         return new

@@ -11,6 +11,10 @@ validation losses are comparable:
   everywhere: that is its situation at inference after the history was cleared.
 * "mixed": frames with an even index by the first rule, those with an odd index by the second.
 
+Where a dataset says who acted (`lansar-record --mode=takeovers`), only the demonstrator's frames count in the loss, and
+the policy's before them are history. Such an episode is then treated as if it began n - 1 frames before the
+demonstrator's first frame and ended with its last one, so that windows hold a frame that counts.
+
 A demonstration of L frames is thus seen L times per epoch, long ones more often than short ones.
 """
 
@@ -80,6 +84,7 @@ class Windows:
         frames: The arrays of `load_frames`.
         targets: (T, 7) from `make_targets`.
         has_target: (T,) bool, False for an episode's last frame with achieved targets.
+        counts: (T,) float32, 1 where the demonstrator acted and 0 elsewhere; None where it always did.
         embeddings: {"static", "gripper"}: (total_frames, D), empty without `use_images`.
         clip_info: The contents of clip.json, empty without `use_images`.
         sentence_tasks: The CALVIN tasks that each sentence can mean; empty unless `paraphrases` or the contrastive
@@ -99,12 +104,17 @@ class Windows:
             self.has_target = np.arange(len(self.targets)) < self.frames["end"] - 1
             if (self.frames["end"] - self.frames["first"] < 2).any():
                 raise ValueError("--policy.target=achieved needs episodes of at least two frames; one is shorter.")
+        demonstrated = self.frames.get("is_intervention", np.True_)
+        self.counts: np.ndarray | None = None if demonstrated.all() else demonstrated.astype(np.float32)
+        self._crop_episodes()
         self.arrays: dict[str, np.ndarray | Tensor] = {
             "state": self.frames["state"],
             "environment_state": self.frames["environment_state"],
             "target": self.targets,
         }
         self.since_command = config.since_command
+        if self.counts is not None:
+            self.arrays["counts"] = self.counts
         self.embeddings: dict[str, np.ndarray | Tensor] = {}
         self.clip_info: dict = {}
         if config.use_images:
@@ -117,6 +127,31 @@ class Windows:
         self._task_rows = {s: [float(task in tasks) for task in known] for s, tasks in self.sentence_tasks.items()}
         self.device = torch.device(config.device or "cpu")
         self._move_to_gpu()
+
+    @property
+    def is_demonstrated(self) -> np.ndarray:
+        """Whether the demonstrator acted in each frame, (T,) or () bool."""
+        return np.True_ if self.counts is None else self.counts > 0
+
+    def _crop_episodes(self) -> None:
+        """Sets where each frame's episode begins and ends as far as windows are concerned, see above.
+
+        Raises:
+            ValueError: The demonstrator acted in no frame.
+        """
+        first, end = self.frames["first"], self.frames["end"]
+        end = end - ~self.has_target[end - 1]
+        self._first, self._end, self._lengths = first, end, end - first
+        if self.counts is None:
+            return
+        rows = np.flatnonzero((self.counts > 0) & self.has_target)
+        if not len(rows):
+            raise ValueError("The demonstrator acted in no frame of the dataset: there is nothing to learn from.")
+        before, after = np.searchsorted(rows, first), np.searchsorted(rows, end) - 1
+        acted = before <= after  # in this episode
+        earliest = np.maximum(rows[np.minimum(before, len(rows) - 1)] - self.length + 1, first)
+        self._first = np.where(acted, earliest, self._first)
+        self._end = np.where(acted, rows[after] + 1, self._end)
 
     def _load_embeddings(self, root: Path, total_frames: int, config: LanSARConfig) -> None:
         embeddings, self.clip_info = load_embeddings(root, total_frames)
@@ -142,8 +177,9 @@ class Windows:
         row = np.searchsorted(known, index)
         if (row >= len(known)).any() or (known[np.minimum(row, len(known) - 1)] != index).any():
             raise IndexError("The batch holds a frame index that the dataset's parquet files do not have.")
-        first, end = self.frames["first"][row], self.frames["end"][row]
-        end = end - ~self.has_target[end - 1]  # a last frame without target belongs to no window
+        first, end = self._first[row], self._end[row]  # a last frame without target belongs to no window
+        place = row - self.frames["first"][row]
+        row = first + place * (end - first) // self._lengths[row]  # the same row, unless its episode was cropped
         spare = np.maximum(end - first - self.length, 0)
         spread = first + np.rint((row - first) * spare / np.maximum(end - first - 1, 1)).astype(np.int64)
         spread = np.minimum(spread, first + spare)
@@ -161,8 +197,9 @@ class Windows:
         Returns:
             State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) and, with `use_images`, static and gripper
             (B, n, D), all float32; with `since_command` start (B, 1, 24), the environment state when the command
-            began; valid_steps (N,) int64, which of the B * n steps are not padding. Padding repeats the window's last
-            step. On the GPU if the frames fit there.
+            began; counts (B, n) float32, 1 where the demonstrator acted, unless it always did; valid_steps (N,) int64,
+            which of the B * n steps are not padding. Padding repeats the window's last step. On the GPU if the frames
+            fit there.
         """
         start, end = self.bounds(index)
         rows = start[:, None] + np.arange((end - start).max())  # (B, n)
