@@ -38,6 +38,7 @@ START_UP = 45
 THESIS = [
     "--config_path=configs/thesis/no_images.yaml",
     "--dataset.eval_split=0",
+    "--eval_steps=0",
     "--policy.clip.model=lansar-tiny",
     "--policy.clip.pretrained=",
 ]
