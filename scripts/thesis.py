@@ -311,6 +311,7 @@ def main() -> int:
         options.eval_device = "cpu"
     options.eval_device = options.eval_device or options.device
     os.chdir(ROOT)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that `run` ends its command, too
     return Thesis(options).main()
 
 
