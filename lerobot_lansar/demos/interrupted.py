@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..calvin import COLORS, POSE_UNITS, TASKS, TCP_POSE, Task
 from ..desk import Desk, is_fulfilled
@@ -17,6 +18,7 @@ from ..desk.starts import sample_start
 from .demonstrator import AFTERWARDS, carry_out
 from .moves import FALLEN, View, lying, on_table
 from .skills import SKILLS
+from .skills.blocks import best_base
 
 DISTURBANCES = ("none", "wander", "grip", "wrong task")
 """What happens between the interruption and the takeover: nothing; up to 30 random steps; up to 30 steps in place with
@@ -113,11 +115,17 @@ def _is_feasible(task: Task, start: View, now: View, begun: Snapshot) -> bool:
         return min(now.slide, now.scene.slide_travel - now.slide) < 0.03
     if task.kind == "place_block":
         return now.drawer > 0.15
+    if task.kind == "rotate_block":
+        turn = Rotation.from_euler("xyz", now.block(str(color))[3:])
+        turn *= Rotation.from_euler("xyz", start.block(str(color))[3:]).inv()
+        return bool(turn.as_matrix()[2, 2] > 0.85)
     if task.kind == "stack_block":
-        return any(on_table(now.block(c)) and _can_be_taken(now, c) for c in COLORS if c != held)
+        return held is not None and best_base(now, held) is not None
     if task.kind == "push_into_drawer":
         pushed = [c for c in COLORS if begun.blocks[c].contacts == {TABLE}]
-        return now.drawer > 0.15 and any(on_table(now.block(c)) and _can_be_taken(now, c) for c in pushed)
+        return now.drawer > 0.15 and any(
+            now.holds(c) or (on_table(now.block(c)) and _can_be_taken(now, c)) for c in pushed
+        )
     return True
 
 

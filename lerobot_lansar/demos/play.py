@@ -1,7 +1,7 @@
 """Play: tasks follow each other without a reset, as in CALVIN's data. Language windows are cut from that: CALVIN's
 short ones around each fulfilled task, or whole subtasks, from the command to its fulfilment."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -17,9 +17,21 @@ from .moves import FALLEN, Style, View, Waypoint, lying
 from .skills import SKILLS
 from .skills.blocks import put_down
 
+NO_WEIGHTS: Mapping[str, float] = {}
 _SHORTEST = 32  # frames in a window, unless its recording began later
 _PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each frame 1.58 times
 _LATEST = 10  # frames after the fulfilment in which a window must end
+
+
+def group_name(task: Task) -> str:
+    """The group of tasks that a weight is given to: its kind, for lifting and placing also where."""
+    if task.kind == "place_block":
+        return task.name
+    return f"lift_{task.place}" if task.kind == "lift_block" else task.kind
+
+
+GROUPS = tuple(dict.fromkeys(group_name(task) for task in TASKS.values()))
+"""The groups of tasks among which play chooses."""
 
 
 def record_play(
@@ -30,6 +42,7 @@ def record_play(
     noise: float,
     variety: float,
     whole: bool = False,
+    weights: Mapping[str, float] = NO_WEIGHTS,
 ) -> Unit:
     """Plays for `frames` control steps and writes all of them.
 
@@ -43,6 +56,7 @@ def record_play(
         writer: Receives the frames.
         noise, variety: As for `demonstrator.demonstrate`.
         whole: The windows are whole subtasks instead of CALVIN's.
+        weights: Group of tasks (`GROUPS`) to how often it is chosen compared with a group that is not named.
 
     Returns:
         What was recorded: stretches between resets, and the windows with their tasks.
@@ -51,7 +65,7 @@ def record_play(
     while writer.frames < frames:
         start, snapshots, fulfilled = writer.frames, [], []
         try:
-            for frame, snapshot, done in _play(desk, frames - start, rng, noise, variety, unit, whole):
+            for frame, snapshot, done in _play(desk, frames - start, rng, noise, variety, unit, whole, weights):
                 writer.add(frame)
                 snapshots.append(snapshot)
                 if done is not None:
@@ -76,6 +90,7 @@ def _play(
     variety: float,
     unit: Unit,
     whole: bool,
+    weights: Mapping[str, float],
 ) -> Iterator[tuple[Frame, Snapshot, tuple[int, str] | None]]:
     """One uninterrupted recording; counts tasks tried and accepted in `unit`.
 
@@ -90,7 +105,7 @@ def _play(
     before: str | None = None
     while left > 0:
         feasible = feasible_tasks(desk.scene, last, obs)
-        task = choose_task(feasible, before, rng) if feasible else None
+        task = choose_task(feasible, before, rng, weights) if feasible else None
         if task is not None:
             unit.tried[task] = unit.tried.get(task, 0) + 1
             before = task
@@ -123,13 +138,17 @@ def stay(view: View) -> Iterator[Waypoint]:
     yield view.go(view.tcp.copy(), float(view.robot_obs[GRIPPER_ACTION]), view.euler, hold=STEPS_PER_COMMAND)
 
 
-def choose_task(tasks: list[Task], before: str | None, rng: np.random.Generator) -> str:
-    """The name of one task: kinds and places are equally likely, and none comes twice in a row if others can."""
+def choose_task(tasks: list[Task], before: str | None, rng: np.random.Generator, weights: Mapping[str, float]) -> str:
+    """The name of one task: groups are as likely as their weights say, and none comes twice in a row if others can."""
     groups: dict[tuple[str, str], list[str]] = {}
     for task in sorted(tasks, key=_color_and_side):
         if task.name != before or len(tasks) == 1:
             groups.setdefault((task.kind, task.place or ""), []).append(task.name)
-    group = groups[sorted(groups)[rng.choice(len(groups))]]
+    names = sorted(groups)
+    likely = np.array([weights.get(group_name(TASKS[groups[name][0]]), 1.0) for name in names])
+    if not likely.any():  # nothing else can be done
+        likely = np.ones(len(names))
+    group = groups[names[rng.choice(len(names), p=likely / likely.sum())]]
     return str(rng.choice(group))
 
 

@@ -153,7 +153,7 @@ def record_unit(config: RecordConfig, index: int) -> None:
         if config.mode != "windows":
             frames = config.session_frames(slot.split)[slot.number]
             rng, whole = np.random.default_rng(seed), config.mode == "chains"
-            unit = record_play(desk, frames, rng, writer, config.noise, config.variety, whole)
+            unit = record_play(desk, frames, rng, writer, config.noise, config.variety, whole, config.weights)
         else:
             task = config.tasks[slot.in_scene % len(config.tasks)]
             demonstration, tried = _attempt(config, desk, task, seed)

@@ -10,6 +10,7 @@ from ..desk import SCENES, DeskError
 from ..jobs.executors import check_executor
 from ..jobs.work import SlurmConfig
 from ..pictures import check_size
+from .play import GROUPS
 from .skills import SKILLS
 
 SPLITS = ("training", "validation")
@@ -92,6 +93,9 @@ class RecordConfig:
     validation_hours: float | None = None
     # Length of a session of play, chains or takeovers; sessions are divided among the workers.
     session_minutes: float = 2.0
+    # How often play, chains and takeovers choose a group of tasks compared with the others, which have 1:
+    # '{lift_slider: 3, place_in_slider: 2}'; 0 leaves it out where anything else can be done.
+    weights: dict[str, float] = field(default_factory=dict)
     # Decides all random choices: the same seed gives the same data for any number of workers.
     seed: int = 0
     # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
@@ -167,6 +171,15 @@ class RecordConfig:
             if not 0.1 <= getattr(self, name) * minutes <= 1e6:
                 raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
         self._check_takeovers()
+        for group, weight in self.weights.items():
+            if group not in GROUPS:
+                raise DeskError(f"--weights: there is no group {group!r} of tasks; choose among: {', '.join(GROUPS)}")
+            if not 0 <= weight <= 100:
+                raise DeskError(f"--weights: a weight lies between 0 and 100, got {weight} for {group}")
+        if self.mode == "windows" and self.weights:
+            raise DeskError(
+                "--weights goes with --mode=play, chains or takeovers; with --mode=windows name a task twice in --tasks"
+            )
         if self.mode != "windows" and self.tasks != list(SKILLS):
             raise DeskError(f"--tasks goes with --mode=windows; --mode={self.mode} carries out whatever is feasible")
 
@@ -196,7 +209,7 @@ class RecordConfig:
         """The options that decide what the recorded data are: all but where they go and where the work runs."""
         without = {"output_dir", "workers", "executor", "slurm", "batch_size"}
         without |= (
-            {"hours", "validation_hours", "session_minutes"}
+            {"hours", "validation_hours", "session_minutes", "weights"}
             if self.mode == "windows"
             else {"tasks", "episodes", "validation_episodes"}
         )

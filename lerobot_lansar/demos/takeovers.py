@@ -244,7 +244,7 @@ class Session:
             feasible = feasible_tasks(self._desk.scene, self._last, self._obs)
             if not feasible or not self._left:
                 return
-            before = task = choose_task(feasible, before, rng)
+            before = task = choose_task(feasible, before, rng, self._config.weights)
             choices = self._sentences[task]
             said[len(self._snapshots)] = sentence = choices[int(self._words.integers(len(choices)))]
             if not (yield from self._command(task, sentence)):

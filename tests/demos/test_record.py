@@ -382,6 +382,9 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
     assert row[2:4] == ["3", "3"]
 
 
+CHAINS = {"mode": "chains", "tasks": list(SKILLS)}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -398,6 +401,12 @@ def test_summary_counts_tries_and_windows(tmp_path, capsys):
         ({"seed": -1}, "--seed must be 0 or more"),
         ({"scene": "D_eval"}, "--scene: 'D_eval' is none of A, B, C, D"),
         ({"mode": "play"}, "--tasks goes with --mode=windows"),
+        (
+            {"weights": {"lift": 2.0}, **CHAINS},
+            "--weights: there is no group 'lift' of tasks; choose among",
+        ),
+        ({"weights": {"lift_slider": -1.0}, **CHAINS}, "--weights: a weight lies between 0 and 100, got -1.0"),
+        ({"weights": {"lift_slider": 2.0}}, "--weights goes with --mode=play or chains"),
         ({"scene": "E"}, "--scene: 'E' is none of A, B, C, D"),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"cameras": ["wrist"]}, "camera 'wrist'"),

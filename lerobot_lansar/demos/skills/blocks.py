@@ -21,7 +21,6 @@ from ..moves import (
     Waypoint,
     approach,
     grasp_yaws,
-    half_width,
     in_cabinet,
     lying,
     on_table,
@@ -42,14 +41,19 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
     """TCP position (3,) m and euler (3,) rad from which the fingers close on a block where it lies."""
     position = view.block(color)[:3] + [0.0, 0.0, 0.002]
     if in_cabinet(position):
+        lean = 0.0
         if position[1] > 0.02:  # behind the door
-            position[0] = np.clip(position[0], *_finger_room(view, position[0]))
+            # beside the wall or the door's edge the hand stays farther inside than its fingertips
+            low, high = _finger_room(view, position[0])
+            beyond = position[0] - np.clip(position[0], low, high)
+            lean = float(np.clip(10 * beyond, -0.3, 0.3))
+            position[0] -= np.clip(beyond, -0.012, 0.012)
         deep = np.clip(position[1] - 0.085, 0.0, 0.04)  # so deep inside the hand itself would touch the door
         position[1] -= 0.3 * deep
         # a leaning hand that is also turned has one finger lower than the other: turn it half as far as the block
         yaw = FORWARD + (yaw - FORWARD) / 2 if abs(yaw - FORWARD) < 0.8 else yaw
-        position[2] += 0.05 * abs(np.sin(yaw - FORWARD)) * np.sin(INTO_CABINET)
-        return position, pointing(yaw, 0.0, INTO_CABINET + 5 * deep)
+        position[2] += 0.05 * abs(np.sin(yaw - FORWARD)) * np.sin(INTO_CABINET) + 0.03 * abs(np.sin(lean))
+        return position, pointing(yaw, lean, INTO_CABINET + 5 * deep)
     if abs(position[2] - TABLE_Z) > 0.025:  # in the drawer, or on another block
         position[2] += 0.008
     elif position[1] > -0.07 and 0.4 < abs(yaw - FORWARD) < 0.9:  # a turned hand would hit the cabinet
@@ -70,41 +74,16 @@ def _finger_room(view: View, x: float) -> tuple[float, float]:
     return min(low, middle), max(high, middle)
 
 
-def _draw_in(view: View, color: str) -> Iterator[Waypoint]:
-    """Slides a block that is too close to a wall or to the door's edge inwards, with a fingertip on its top."""
-    for _ in range(4):
-        x, y = view.block(color)[:2]
-        low, high = _finger_room(view, x)
-        slack = 0.037 - half_width(view, color, np.array([1.0, 0.0]))
-        aim = float(np.clip(x, low - slack, high + slack))
-        if abs(aim - x) < 0.002 or y > 0.16:
-            return
-        inwards = np.sign(aim - x)
-        aim += 0.02 * inwards
-        # turned so that the hand's end beside the door or wall is outside the cabinet
-        lean = _hold(view, color, FORWARD)[1]
-        euler = pointing(FORWARD + inwards, 0.0, -lean[1])
-        top = np.array([x, y, view.block(color)[2] + BLOCK_SIDE / 2 + 0.016])
-        yield from travel(view, top - 0.14 * approach(euler), CLOSED, euler)
-        yield view.go(top - 0.05 * approach(euler), CLOSED, euler, tolerance=0.01)
-        yield view.go(top - [0, 0, 0.002], CLOSED, euler, slow=0.8, tolerance=0.012)
-        yield view.go(top + [(aim - x) / 4, -0.005, -0.03], CLOSED, euler, slow=0.6, tolerance=0.03)
-        yield view.go(top + [aim - x, -0.01, -0.03], CLOSED, euler, slow=0.6, tolerance=0.015)
-        yield view.go(view.tcp - 0.1 * approach(euler), CLOSED, euler, tolerance=0.03)
-
-
 def take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     """Moves the open hand around a block and closes it; `turn` (rad) is how far the wrist must turn afterwards."""
-    if in_cabinet(view.block(color)) and view.block(color)[1] > 0.02:
-        yield from _draw_in(view, color)
     yaws = grasp_yaws(view, color)
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw + turn <= YAWS[1]] or yaws
-    yaw = yaws[0] + view.scatter(0.08)
+    in_there = in_cabinet(view.block(color))
+    yaw = yaws[0] + (0.0 if in_there else view.scatter(0.08))
+    lead = 0.2 if in_there else 0.08 + abs(view.scatter(0.03))
     position, euler = _hold(view, color, yaw)
-    lead = 0.2 if in_cabinet(position) else 0.08 + abs(view.scatter(0.03))
     if not under_way(view, position - 0.8 * lead * approach(euler), position, euler, OPEN):
-        gripper = OPEN if view.held() else view.style.idle_gripper
-        yield from travel(view, position - lead * approach(euler), gripper, euler)
+        yield from travel(view, position - lead * approach(euler), OPEN, euler)
         yield view.go(position - 0.8 * lead * approach(euler), OPEN, euler, tolerance=0.012)
         position, euler = _hold(view, color, yaw)
         yield view.go(position - 0.03 * approach(euler), OPEN, euler, slow=0.9, tolerance=0.01)
@@ -238,9 +217,9 @@ def place_in_slider(view: View, color: str) -> Iterator[Waypoint]:
     middle, room = (low + high) / 2, max((high - low) / 2 - 0.07, 0.0)
     places = [np.array([middle + s * room, 0.088, 0.0]) for s in (0.0, 0.5, -0.5, 1.0, -1.0)]
     x = _freest(view, color, places)[0]
-    x = float(np.clip(x + view.scatter(0.02), middle - room, middle + room))
-    before = np.array([x, -0.10, 0.60 + abs(view.scatter(0.02))])
-    inside = np.array([x, 0.082 + view.scatter(0.01), 0.525])
+    x = float(np.clip(x + view.scatter(0.01), middle - room, middle + room))
+    before = np.array([x, -0.10, 0.60])
+    inside = np.array([x, 0.082, 0.525])
     way = [(before, 1.0, 0.015), (inside, 0.9, 0.01), (np.array([x, 0.088, 0.480]), 0.7, 0.008)]
     # the long side of the block points inwards
     yaw = FORWARD + float(np.clip(view.yaw - FORWARD, -0.3, 0.3))
@@ -269,7 +248,7 @@ def _freest(view: View, color: str, places: list[np.ndarray]) -> np.ndarray:
 @_carrying
 def stack_block(view: View, color: str) -> Iterator[Waypoint]:
     """Carry the block over another one, align it with that one, lower it and let go."""
-    base = _best_base(view, color)
+    base = best_base(view, color)
     if base is None:
         return
     below = view.block(base)
@@ -285,7 +264,7 @@ def stack_block(view: View, color: str) -> Iterator[Waypoint]:
     yield from set_down_from_above(view, color, place, yaw, 0.57)
 
 
-def _best_base(view: View, color: str) -> str | None:
+def best_base(view: View, color: str) -> str | None:
     """The block to stack on: the nearest to the hand of those on the table with nothing on them."""
 
     def is_free(base: str) -> bool:
