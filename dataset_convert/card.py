@@ -129,7 +129,7 @@ With LeRobot and the plugin lerobot_policy_lansar installed beside it:
 def _features(info: dict[str, Any], action: str) -> str:
     rows = []
     for key, feature in info["features"].items():
-        if not key.startswith(("observation.", "action", "calvin.")):
+        if not key.startswith(("observation.", "action", "calvin.", "complementary_info.")):
             continue
         shape = "×".join(str(size) for size in feature["shape"])
         text = _ACTION[action] if key == "action" else _MEANING.get(key, "fingertip sensor")

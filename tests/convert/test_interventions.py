@@ -62,7 +62,10 @@ def test_lerobots_command_merges_takeovers_with_other_recordings(takeovers, tmp_
     verify.verify(VerifyConfig("me/plain", plain.root, roots[1]))
     command = [sys.executable, "-m", "lerobot.scripts.lerobot_edit_dataset", "--operation.type=merge"]
     command += ["--new_repo_id=me/both", f"--new_root={tmp_path / 'both'}"]
-    command += ["--operation.repo_ids=['me/takeovers','me/plain']", f"--operation.roots={[str(root) for root in roots]}"]
+    command += [
+        "--operation.repo_ids=['me/takeovers','me/plain']",
+        f"--operation.roots={[str(root) for root in roots]}",
+    ]
     subprocess.run(command, check=True, capture_output=True, text=True)
     merged, parts = LeRobotDataset("me/both", root=tmp_path / "both"), [len(pq.read_table(r / "data")) for r in roots]
     acted = np.array([bool(item[INTERVENTION_FEATURE]) for item in merged])
