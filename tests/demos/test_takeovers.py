@@ -235,7 +235,7 @@ def test_a_policy_that_needs_something_else_is_refused_with_the_option_to_set(ac
     ):
         with pytest.raises(CommandError, match=message):
             record(options(tmp_path / "desk", act, **changes))
-    with pytest.raises(CommandError, match="holds no config.json"):
+    with pytest.raises(CommandError, match=r"holds no config\.json"):
         record(options(tmp_path / "desk", tmp_path))
 
 
