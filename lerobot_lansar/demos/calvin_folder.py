@@ -39,10 +39,10 @@ class Unit:
         windows: (first, end, task): the task is fulfilled in frames [first, end).
         tried: Task to how often it was tried.
         accepted: Task to how often the oracle saw it fulfilled.
+        sums: For `robot_obs` and `scene_obs` (as on disk) the sums over frames of each value and of its square.
         sentences: Of each window; empty: they are chosen when the split is published.
         alone: Task to how often a policy fulfilled it without the demonstrator (takeovers).
         demonstrated: Frames in which the demonstrator acted, not a policy (takeovers).
-        sums: For `robot_obs` and `scene_obs` (as on disk) the sums over frames of each value and of its square.
     """
 
     scene: str
@@ -51,10 +51,10 @@ class Unit:
     windows: list[tuple[int, int, str]] = field(default_factory=list)
     tried: dict[str, int] = field(default_factory=dict)
     accepted: dict[str, int] = field(default_factory=dict)
+    sums: dict[str, list[list[float]]] = field(default_factory=dict)
     sentences: list[str] = field(default_factory=list)
     alone: dict[str, int] = field(default_factory=dict)
     demonstrated: int = 0
-    sums: dict[str, list[list[float]]] = field(default_factory=dict)
 
     def save(self, file: Path) -> None:
         """Writes the unit to `file`, which is complete whenever it exists."""

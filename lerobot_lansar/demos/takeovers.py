@@ -136,7 +136,7 @@ class Actor:
     def act(self, requests: Sequence[Request]) -> np.ndarray:
         """(B, 7) the actions for all sessions, as LeRobot's `rollout` computes them."""
         before_env, after_env, before, after = self._processors
-        buffer = create_empty_array(self._space, n=len(requests), fn=np.zeros)
+        buffer: Any = create_empty_array(self._space, n=len(requests), fn=np.zeros)
         stacked = concatenate(self._space, [request.observation for request in requests], buffer)
         batch = preprocess_observation(stacked)  # type: ignore[arg-type]
         batch["task"] = [request.sentence for request in requests]

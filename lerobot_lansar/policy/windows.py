@@ -104,7 +104,7 @@ class Windows:
             self.has_target = np.arange(len(self.targets)) < self.frames["end"] - 1
             if (self.frames["end"] - self.frames["first"] < 2).any():
                 raise ValueError("--policy.target=achieved needs episodes of at least two frames; one is shorter.")
-        demonstrated = self.frames.get("is_intervention", np.True_)
+        demonstrated = self.frames.get("is_intervention", np.ones(len(self.targets), bool))
         self.counts: np.ndarray | None = None if demonstrated.all() else demonstrated.astype(np.float32)
         self._crop_episodes()
         self.arrays: dict[str, np.ndarray | Tensor] = {
@@ -130,8 +130,8 @@ class Windows:
 
     @property
     def is_demonstrated(self) -> np.ndarray:
-        """Whether the demonstrator acted in each frame, (T,) or () bool."""
-        return np.True_ if self.counts is None else self.counts > 0
+        """Whether the demonstrator acted in each frame, (T,) bool."""
+        return np.ones(len(self.targets), bool) if self.counts is None else self.counts > 0
 
     def _crop_episodes(self) -> None:
         """Sets where each frame's episode begins and ends as far as windows are concerned, see above.
