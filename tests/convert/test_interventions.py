@@ -38,7 +38,7 @@ def test_the_column_is_what_the_frames_say_and_verify_sees_a_change(takeovers, t
     assert f"`{INTERVENTION_FEATURE}`" in (out / "README.md").read_text()
     asked = VerifyConfig("me/takeovers", takeovers.root, out)
     verify.verify(asked)
-    (file,) = (out / "data").rglob("*.parquet")
+    file, *_ = sorted((out / "data").rglob("*.parquet"))
     table = pq.read_table(file)
     place = table.column_names.index(INTERVENTION_FEATURE)
     changed = pa.array([not value for value in table[INTERVENTION_FEATURE].to_pylist()])
