@@ -7,9 +7,8 @@ with one call. Imports LeRobot, which takes seconds; other modes of lansar-recor
 import hashlib
 import os
 from collections.abc import Generator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -348,12 +347,6 @@ class Session:
 # ---- a batch of sessions
 
 
-@cache
-def _desk(place: int, scene: str, assets: str | None, cameras: tuple[str, ...], renderer: str, depth: bool) -> Desk:
-    """One desk per process, scene and place in the batch."""
-    return Desk(scene, assets, cameras, renderer, depth)
-
-
 def record_sessions(
     config: RecordConfig,
     units: Sequence[tuple[int, str, str, int, list[int], Path]],
@@ -369,18 +362,21 @@ def record_sessions(
     Yields:
         Number and unit of each session, as soon as it is finished.
     """
-    sessions = []
-    for place, (_, split, scene, frames, seed, folder) in enumerate(units):
-        desk = _desk(place, scene, config.assets, tuple(config.cameras), config.renderer, config.depth)
-        sessions.append(Session(config, desk, frames, seed, sentences[split], folder))
-    actor, playing = Actor(config, sessions), [session.play() for session in sessions]
-    requests = [next(play) for play in playing]
-    under_way = list(range(len(sessions)))
-    while under_way:
-        actions = actor.act(requests)  # those of sessions that are over go on with their last request
-        for k in list(under_way):
-            try:
-                requests[k] = playing[k].send(actions[k])
-            except StopIteration as end:
-                under_way.remove(k)
-                yield units[k][0], end.value
+    with ExitStack() as desks:
+        sessions = []
+        for _, split, scene, frames, seed, folder in units:
+            # A new desk each: where several are open, one that was used before can differ in the last digits.
+            desk = Desk(scene, config.assets, config.cameras, config.renderer, config.depth)
+            desks.enter_context(desk)
+            sessions.append(Session(config, desk, frames, seed, sentences[split], folder))
+        actor, playing = Actor(config, sessions), [session.play() for session in sessions]
+        requests = [next(play) for play in playing]
+        under_way = list(range(len(sessions)))
+        while under_way:
+            actions = actor.act(requests)  # those of sessions that are over go on with their last request
+            for k in list(under_way):
+                try:
+                    requests[k] = playing[k].send(actions[k])
+                except StopIteration as end:
+                    under_way.remove(k)
+                    yield units[k][0], end.value
