@@ -80,7 +80,12 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "windows of 64 steps, 24 a batch": (["--policy.window=64", "--batch_size=24"], []),
     "windows of 8 steps, 192 a batch": (["--policy.window=8", "--batch_size=192"], []),
     "hidden 128, feedforward 512": (["--policy.hidden=128", "--policy.feedforward=512"], []),
-    "learning rate 0.002": (["--policy.learning_rate=0.002"], []),
+    "AdamW, learning rate 0.0015": (
+        ["--policy.optimizer=adamw", "--policy.learning_rate=0.0015", "--policy.weight_decay=0.01"],
+        [],
+    ),
+    "weight decay 0.01": (["--policy.weight_decay=0.01"], []),
+    "changes since the command": (["--policy.since_command=true"], []),
 }
 """Variant to its options of training and of evaluation, which override the configuration file. Variants with the same
 training options share a checkpoint."""
@@ -158,26 +163,23 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
     checkpoint, minutes = train(options, training, seed)
     folder = checkpoint.parents[3] / key(evaluation, options.chains)
     if not (folder / "report.json").exists():
-        shutil.rmtree(folder, ignore_errors=True)
         log = folder.with_suffix(".log")
         command(
-            "lerobot-eval",
+            "lansar-eval",
             f"--policy.path={checkpoint}",
             "--env.type=calvin",
             "--env.control_mode=abs",
             "--env.cameras=[]",
             f"--env.annotations={COMMANDS}",
-            "--env.render_fps=1",
-            f"--env.results_dir={folder}",
             *evaluation,
-            f"--eval.n_episodes={options.chains}",
-            "--eval.batch_size=10",
-            "--eval.use_async_envs=false",
+            f"--chains={options.chains}",
+            "--workers=1",
+            "--videos=0",
             "--seed=0",
             f"--output_dir={folder}",
             log=log,
         )
-        command("lansar-report", f"--eval_dir={folder}", f"--policy_path={checkpoint}", log=log)
+        command("lansar-report", f"--eval_dir={folder}", log=log)
     (report,) = json.loads((folder / "report.json").read_text())["tables"][0]["evaluations"]
     figures = {name: report[name] for name in ("average_length", "in_a_row", "local_success_rate", "tasks")}
     return {"variant": variant, "seed": seed, "train_minutes": minutes, **figures}
