@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_lansar.calvin import BULB, CHAIN_LENGTH, CONTROL_HZ, LED, TASKS, WINDOW_FRAMES, relative_action
 from lerobot_lansar.demos.calvin_folder import FrameWriter
-from lerobot_lansar.demos.play import _choose, cut_windows, feasible_tasks, record_play
+from lerobot_lansar.demos.play import choose_task, cut_windows, feasible_tasks, record_play
 from lerobot_lansar.demos.record import RecordConfig, record
 from lerobot_lansar.desk import Desk, completed_tasks, is_fulfilled
 from lerobot_lansar.desk.starts import sample_start
@@ -102,10 +102,10 @@ def test_what_is_feasible_in_play_succeeds(tmp_path):
 def test_weights_decide_how_often_a_group_of_tasks_is_chosen():
     tasks = [TASKS[name] for name in ("lift_red_block_slider", "lift_blue_block_slider", "open_drawer", "turn_on_led")]
     rng, weights = np.random.default_rng(0), {"lift_slider": 3.0, "turn_on_led": 0.0}
-    chosen = Counter(_choose(tasks, None, rng, weights) for _ in range(400))
+    chosen = Counter(choose_task(tasks, None, rng, weights) for _ in range(400))
     assert set(chosen) == {"lift_red_block_slider", "lift_blue_block_slider", "open_drawer"}
     assert 70 <= chosen["open_drawer"] <= 130  # a quarter
-    assert _choose([TASKS["turn_on_led"]], None, rng, weights) == "turn_on_led"  # nothing else can be done
+    assert choose_task([TASKS["turn_on_led"]], None, rng, weights) == "turn_on_led"  # nothing else can be done
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -406,7 +406,7 @@ CHAINS = {"mode": "chains", "tasks": list(SKILLS)}
             "--weights: there is no group 'lift' of tasks; choose among",
         ),
         ({"weights": {"lift_slider": -1.0}, **CHAINS}, "--weights: a weight lies between 0 and 100, got -1.0"),
-        ({"weights": {"lift_slider": 2.0}}, "--weights goes with --mode=play or chains"),
+        ({"weights": {"lift_slider": 2.0}}, "--weights goes with --mode=play, chains or takeovers"),
         ({"scene": "E"}, "--scene: 'E' is none of A, B, C, D"),
         ({"episodes": 0}, "--episodes must be at least 1"),
         ({"cameras": ["wrist"]}, "camera 'wrist'"),

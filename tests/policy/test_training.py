@@ -255,6 +255,8 @@ def test_the_thesis_preset_is_the_thesis():
         "state_noise": 0.0,
         "contrastive_weight": 0.0,
         "dtype": "float32",
+        "compile_model": False,
+        "compile_mode": "default",
     }
     config, rest = training_config("thesis/baseline")
     options = {option.name for option in fields(config)} - {option.name for option in fields(PreTrainedConfig)}
