@@ -19,7 +19,7 @@ BIN = Path(sys.executable).parent
 DATA = Path("data/quickstart")
 OUT = Path("outputs/quickstart")
 CONFIG = "configs/lansar.yaml"
-UPDATES = 3000
+UPDATES = 1500
 SENTENCES = "configs/sentences.yaml"
 TASKS = [
     "open_drawer",
