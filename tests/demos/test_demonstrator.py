@@ -200,7 +200,7 @@ def test_another_demonstrator_finishes_what_was_interrupted():
 @pytest.mark.parametrize("scene", SCENES)
 def test_interrupted_tasks_of_every_kind_are_finished(scene):
     jobs = [(scene, task, 10) for task in TASKS]
-    done, possible = np.sum(in_processes(takeovers, jobs, os.cpu_count(), ordered=True), axis=0)
+    done, possible = np.sum(list(in_processes(takeovers, jobs, os.cpu_count(), ordered=True)), axis=0)
     assert possible >= 0.8 * 10 * len(jobs)
     assert done >= 0.95 * possible
 
