@@ -60,10 +60,11 @@ def prepare(config: RecordConfig) -> RecordConfig:
     policy = replace(config.policy, path=str(Path(path).resolve()), sha256=checkpoint_sha256(Path(path)))
     unit = config.env.depth_unit or (trained_depth_unit() if config.depth else None)
     config = replace(config, policy=policy, env=replace(config.env, depth_unit=unit))
-    features = _policy_config(config).input_features or {}
+    trained = _policy_config(config)
+    features = trained.input_features or {}
     shapes = {key: tuple(feature.shape) for key, feature in features.items()}
     check_policy(config.env.task_in_state, pictures_of(config), shapes, option="--")
-    reads_pictures = getattr(_policy_config(config), "use_images", True)
+    reads_pictures = getattr(trained, "use_images", True)
     cameras = {key.rsplit(".", 1)[1] for key, feature in features.items() if feature.type is FeatureType.VISUAL}
     missing = {camera.removesuffix("_depth") for camera in cameras} - set(config.cameras)
     if missing and reads_pictures:

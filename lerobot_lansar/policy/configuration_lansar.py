@@ -21,7 +21,6 @@ CHOICES = {
     "window_start": ("episode", "anywhere", "mixed"),
     "control_mode": ("abs", "rel"),
     "dtype": ("float32", "bfloat16"),
-    "compile_mode": ("default", "max-autotune-no-cudagraphs"),
     "optimizer": ("adamw", "muon"),
 }
 
@@ -96,8 +95,6 @@ class LanSARConfig(PreTrainedConfig):
     # In training, the two transformers are compiled (torch.compile): a minute at the start, fewer and larger kernels
     # afterwards. Other kernels round differently.
     compile_model: bool = False
-    # The mode of torch.compile: default, or max-autotune-no-cudagraphs, which tries out kernels first.
-    compile_mode: str = "default"
 
     # Beta of the smooth L1 losses (Eq 4.3, 4.4).
     smooth_l1_beta: float = 0.1

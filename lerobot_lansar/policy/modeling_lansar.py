@@ -113,7 +113,7 @@ class LanSARPolicy(PreTrainedPolicy):
             )
             set_current(windows)
             if config.compile_model:
-                self.network.compile_transformers(config.compile_mode)
+                self.network.compile_transformers()
             self._losses = Losses()
             if (parser.parse_arg("resume") or "").lower() == "true":
                 self._losses.load(Path(str(config.pretrained_path)))
@@ -301,7 +301,8 @@ class LanSARPolicy(PreTrainedPolicy):
         gripper: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Adds one step to the histories: (B, 15), (B, 24), (B, D)... -> scaled motion (B, 6), gripper logits (B,)."""
-        x, blocks, scene = self.scaler.encode(state, environment_state, self._starts(environment_state))
+        start = self._starts(environment_state) if self.config.since_command else None
+        x, blocks, scene = self.scaler.encode(state, environment_state, start)
         commands = self._encode_commands(command)
         modalities = self.network.encode_modalities(x, blocks, scene, static, gripper)
         contexts = self.network.encode_context(modalities, commands[0])  # (B, h)

@@ -27,7 +27,6 @@ mask is needed. Padded steps never enter an MLP, where they would distort BatchN
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -230,20 +229,17 @@ class LanSARNetwork(nn.Module):
         self.apply(self._initialise)
         self._encode_context, self._decode = self.encode_context, self.decode  # `compile_transformers` replaces them
 
-    def compile_transformers(self, mode: str = "default", backend: str = "inductor") -> None:
+    def compile_transformers(self, backend: str = "inductor") -> None:
         """Makes `forward` run the two transformers through torch.compile; weights keep their names.
 
         Steps and windows vary from batch to batch, so their number is a variable of the compiled code. Attention,
         encoding and decoding of single steps (`encode_context`, `decode`) stay as they are.
 
         Args:
-            mode, backend: Of torch.compile.
+            backend: Of torch.compile.
         """
-        options: dict[str, Any] = {"dynamic": True, "backend": backend}
-        if backend == "inductor":
-            options["mode"] = mode
-        self._encode_context = torch.compile(self.encode_context, **options)
-        self._decode = torch.compile(self.decode, **options)
+        self._encode_context = torch.compile(self.encode_context, dynamic=True, backend=backend)
+        self._decode = torch.compile(self.decode, dynamic=True, backend=backend)
 
     @staticmethod
     def _initialise(module: nn.Module) -> None:

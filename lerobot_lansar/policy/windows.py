@@ -205,16 +205,13 @@ class Windows:
         rows = start[:, None] + np.arange((end - start).max())  # (B, n)
         valid_steps = np.flatnonzero(rows < end[:, None])
         rows = np.minimum(rows, end[:, None] - 1)
-        first = self.frames["first"][start][:, None]
         frame_rows, embedding_rows = rows, self.frames["index"][rows] if self.embeddings else rows
         if self.on_gpu:
-            frame_rows, embedding_rows, first = (
-                torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows, first)
-            )
+            frame_rows, embedding_rows = (torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows))
         found = {name: array[frame_rows] for name, array in self.arrays.items()}
         found |= {name: array[embedding_rows] for name, array in self.embeddings.items()}
         if self.since_command:
-            found["start"] = self.arrays["environment_state"][first]
+            found["start"] = self.arrays["environment_state"][self.frames["first"][start][:, None]]
         window = {name: torch.as_tensor(values).float() for name, values in found.items()}
         return window | {"valid_steps": torch.from_numpy(valid_steps)}
 

@@ -256,7 +256,6 @@ def test_the_thesis_preset_is_the_thesis():
         "contrastive_weight": 0.0,
         "dtype": "float32",
         "compile_model": False,
-        "compile_mode": "default",
     }
     config, rest = training_config("thesis/baseline")
     options = {option.name for option in fields(config)} - {option.name for option in fields(PreTrainedConfig)}
