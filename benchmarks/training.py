@@ -17,7 +17,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +148,8 @@ def updates(options: Options, variant: str, config: LanSARConfig, root: Path) ->
         raise ValueError(f"--variants: {variant!r} is not float32, tf32 or bfloat16, each with or without +compile.")
     torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
     dataset = LeRobotDataset("benchmark/random", root=root)
+    plain = LanSARPolicy(config, dataset_meta=dataset.meta).to(options.device).train()
+    config = replace(config, compile_model=bool(compiled))
     policy = LanSARPolicy(config, dataset_meta=dataset.meta).to(options.device).train()
     preprocess, _ = make_lansar_pre_post_processors(config)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
@@ -170,9 +172,12 @@ def updates(options: Options, variant: str, config: LanSARConfig, root: Path) ->
         while True:
             yield from loader
 
-    def update(batch: dict[str, Any]) -> None:
+    def loss_of(policy: LanSARPolicy, batch: dict[str, Any]) -> torch.Tensor:
         with torch.autocast(device_type, dtype=torch.bfloat16, enabled=precision == "bfloat16"):
-            loss, _ = policy.forward(batch)
+            return policy.forward(batch)[0]
+
+    def update(batch: dict[str, Any]) -> None:
+        loss = loss_of(policy, batch)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10)
         optimizer.step()
@@ -186,14 +191,13 @@ def updates(options: Options, variant: str, config: LanSARConfig, root: Path) ->
         batch = preprocess(next(source))
         finished(options.device)
         ready = time.perf_counter()
-        if number == 0:  # on a CPU, the counter misses fused attention kernels: count with plain matrix products
+        if number == 0:
+            # The counter sees neither inside compiled code nor, on a CPU, fused attention.
             with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-                update(batch)
+                loss_of(plain, batch).backward()
             operations = counter.get_total_flops() // len(batch["valid_steps"])
-            if compiled:  # after counting: the counter does not see inside compiled code
-                policy.network.compile_transformers()
-        else:
-            update(batch)
+            del plain
+        update(batch)
         finished(options.device)
         waiting.append(ready - start)
         computing.append(time.perf_counter() - ready)

@@ -27,6 +27,7 @@ mask is needed. Padded steps never enter an MLP, where they would distort BatchN
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -34,6 +35,8 @@ from torch import Tensor, nn
 
 from .cache import CacheView, KeyValueCache, token_count
 
+PACKED = 8
+"""Timesteps whose few tokens attend as one sequence in training: a GPU's attention kernels work on tiles of 64 tokens."""
 CONTRAST_TEMPERATURE = 0.07  # CLIP's initial temperature
 
 
@@ -123,6 +126,9 @@ class Attention(nn.Module):
         """x (B, t, h), memory (B, s, h) -> (B, t, h). With `cache`, the keys and values in its `slot` precede those of
         `memory`, and its mask is used.
         """
+        few = self.training and not causal and cache is None and self.weights is None
+        if few and x.is_cuda and len(x) % PACKED == 0:
+            return self._packed(x, memory)
         # (B, t, h) -> (B, heads, t, h / heads)
         q = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         k = self.key(memory).unflatten(-1, (self.heads, -1)).transpose(1, 2)
@@ -136,6 +142,20 @@ class Attention(nn.Module):
         p = self.dropout if self.training else 0.0
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=p, is_causal=causal)
         return self.out(y.transpose(1, 2).flatten(2))
+
+    def _packed(self, x: Tensor, memory: Tensor) -> Tensor:
+        """What `forward` computes without causality, for `PACKED` sequences as if they were one, each seeing itself."""
+        t, s = x.shape[1], memory.shape[1]
+        q = self.query(x).reshape(-1, PACKED * t, self.heads, x.shape[-1] // self.heads).transpose(1, 2)
+        k, v = (
+            project(memory).reshape(-1, PACKED * s, self.heads, x.shape[-1] // self.heads).transpose(1, 2)
+            for project in (self.key, self.value)
+        )
+        own = torch.eye(PACKED, dtype=torch.bool, device=x.device)
+        mask = own.repeat_interleave(t, dim=0).repeat_interleave(s, dim=1)  # (PACKED * t, PACKED * s)
+        p = self.dropout if self.training else 0.0
+        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=p)
+        return self.out(y.transpose(1, 2).reshape(len(x), t, -1))
 
 
 class FeedForward(nn.Sequential):
@@ -227,19 +247,23 @@ class LanSARNetwork(nn.Module):
         self.motion_head = head_mlp(h, 6, norm, p)
         self.gripper_head = head_mlp(h, 1, norm, p)
         self.apply(self._initialise)
-        self._encode_context, self._decode = self.encode_context, self.decode  # `compile_transformers` replaces them
+        # `compile_transformers` replaces these.
+        self._encode_context, self._decode, self._whole_windows = self.encode_context, self.decode, False
 
-    def compile_transformers(self, backend: str = "inductor") -> None:
+    def compile_transformers(self, **options: Any) -> None:
         """Makes `forward` run the two transformers through torch.compile; weights keep their names.
 
-        Steps and windows vary from batch to batch, so their number is a variable of the compiled code. Attention,
-        encoding and decoding of single steps (`encode_context`, `decode`) stay as they are.
+        Both then see whole windows, padding included, so that their shapes are always the same (as long as all batches
+        are: `Windows` pads to the longest window there can be). On a GPU, their kernels are launched by CUDA graphs.
+        Encoding and decoding of single steps (`encode_context`, `decode`) stay as they are.
 
         Args:
-            backend: Of torch.compile.
+            options: Of torch.compile.
         """
-        self._encode_context = torch.compile(self.encode_context, dynamic=True, backend=backend)
-        self._decode = torch.compile(self.decode, dynamic=True, backend=backend)
+        options = options or {"mode": "reduce-overhead"}
+        self._encode_context = torch.compile(self.encode_context, dynamic=False, **options)
+        self._decode = torch.compile(self.decode, dynamic=False, **options)
+        self._whole_windows = True
 
     @staticmethod
     def _initialise(module: nn.Module) -> None:
@@ -281,14 +305,16 @@ class LanSARNetwork(nn.Module):
         commands = self.encode_command(command)
         modalities = self.encode_modalities(state, blocks, scene, static, gripper)
         states = self.state_target(state)
-        contexts = self._encode_context(modalities, commands[0][valid_steps // n])
 
         def pad(steps: Tensor) -> Tensor:
-            """(N, h) -> (B, n, h), zeros where there is padding."""
-            padded = steps.new_zeros(batch * n, steps.shape[-1]).index_copy(0, valid_steps, steps)
-            return padded.unflatten(0, (batch, n))
+            """(N, ...) -> (B * n, ...), zeros where there is padding."""
+            return steps.new_zeros(batch * n, *steps.shape[1:]).index_copy(0, valid_steps, steps)
 
-        decoded = self._decode(pad(contexts), pad(states), commands)
+        if self._whole_windows:
+            contexts = self._encode_context(pad(modalities), commands[0].repeat_interleave(n, dim=0))
+        else:
+            contexts = pad(self._encode_context(modalities, commands[0][valid_steps // n]))
+        decoded = self._decode(contexts.unflatten(0, (batch, n)), pad(states).unflatten(0, (batch, n)), commands)
         motion, logit = self.predict(decoded.flatten(0, 1)[valid_steps])
         contrast = None
         if self.config.contrastive and command_tasks is not None:

@@ -96,6 +96,7 @@ class Windows:
 
     def __init__(self, root: Path, features: dict, total_frames: int, config: LanSARConfig) -> None:
         self.length, self.rule = config.window, config.window_start
+        self.pad_fully = config.compile_model
         form = action_form(features)
         self.frames = load_frames(root)
         self.targets = make_targets(self.frames, form, config.target)
@@ -189,7 +190,8 @@ class Windows:
         return start, np.minimum(start + self.length, end)
 
     def batch(self, index: np.ndarray) -> dict[str, Tensor]:
-        """Windows for sampled frames, padded at their end to the longest of this batch (n steps).
+        """Windows for sampled frames, padded at their end to n steps: the longest of this batch, or the longest there
+        can be with `compile_model`.
 
         Args:
             index: (B,) absolute frame numbers.
@@ -202,7 +204,8 @@ class Windows:
             fit there.
         """
         start, end = self.bounds(index)
-        rows = start[:, None] + np.arange((end - start).max())  # (B, n)
+        longest = self.length if self.pad_fully else (end - start).max()
+        rows = start[:, None] + np.arange(longest)  # (B, n)
         valid_steps = np.flatnonzero(rows < end[:, None])
         rows = np.minimum(rows, end[:, None] - 1)
         frame_rows, embedding_rows = rows, self.frames["index"][rows] if self.embeddings else rows

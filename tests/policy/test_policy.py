@@ -469,8 +469,10 @@ def test_muon_updates_hidden_matrices_and_adamw_the_rest():
         return muon, torch.optim.AdamW(second, lr=0.01, weight_decay=0.1)
 
     expected = updated(torchs_own, 4)
-    assert torch.equal(updated(lambda policy: [config.build(policy.get_optim_params())], 4), expected)
-    assert torch.equal(updated(lambda policy: [config.build(policy.get_optim_params())], 4, resume_after=2), expected)
+    ours = updated(lambda policy: [config.build(policy.get_optim_params())], 4)
+    # Equal where measured, but a processor may round bfloat16 products of stacked matrices otherwise.
+    torch.testing.assert_close(ours, expected, rtol=0, atol=2e-4)
+    assert torch.equal(updated(lambda policy: [config.build(policy.get_optim_params())], 4, resume_after=2), ours)
     # --optimizer.type=muon for any policy: everything with two dimensions
     shapes = [[p.ndim for p in group["params"]] for group in config.build(policy.parameters()).param_groups]
     assert [set(part) for part in shapes] == [{2}, {1}]

@@ -73,6 +73,10 @@ def test_a_batch_of_windows_is_what_a_plain_loop_gives(form, target, relative, a
         expected = [reference_target(episode, form, target, s) for s in range(t, t + length)]
         np.testing.assert_allclose(batch["target"][row, :length], expected, atol=2e-6)
     assert batch["state"].shape[1] == 64
+    short = [182]  # its window ends with the demonstration
+    compiled = make_windows(root, target=target, window_start="anywhere", compile_model=True)
+    widths = [each.batch(np.array(short))["state"].shape[1] for each in (windows, compiled)]
+    assert widths[0] < widths[1] == 64  # compiled code wants one shape
 
 
 def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path, monkeypatch):
