@@ -31,8 +31,10 @@ FRAMES_PER_CORE = 200
 """Frames that one core records in a second, without pictures (docs/benchmarks.md: 224, start-up included)."""
 SHARES = {"record": 0.2, "evaluate": 0.25}
 """Shares of the time for recording and for both evaluations; training takes what is left."""
-START_UP = 45
+START_UP = 100
 """Seconds of a training that are no updates: imports, reading the data, compiling, the checkpoint."""
+RECORDERS = 0.75
+"""Share of the cores that record; the others compile meanwhile, which takes minutes if they are busy."""
 # Pictures (the rows "Baseline" and "No Space") would need lansar-record's cameras and lansar-convert
 # --embed=true here, and configs/thesis/baseline.yaml below.
 THESIS = [
@@ -52,6 +54,9 @@ RECOMMENDED = [
     "--policy.position_scale_start=1",
     "--policy.position_scale_slope=0",
     "--policy.yaw_scale=1",
+    "--policy.optimizer=muon",  # the learning rate was not searched at this size
+    "--policy.learning_rate=2e-3",
+    "--policy.weight_decay=0.1",
 ]
 ROWS = {"recommended": [*THESIS, *RECOMMENDED], "thesis": THESIS}
 TINY = ["hidden=16", "context_layers=1", "context_heads=2", "decoder_layers=1", "decoder_heads=2", "feedforward=32"]
@@ -114,7 +119,8 @@ class Thesis:
     def record(self) -> None:
         """Demonstrations, converted."""
         o, data = self.options, self.out / "data"
-        hours = SHARES["record"] * self.seconds * o.workers * FRAMES_PER_CORE / (30 * 3600)
+        workers = max(1, int(RECORDERS * o.workers))
+        hours = SHARES["record"] * self.seconds * workers * FRAMES_PER_CORE / (30 * 3600)
         if not (data / "chains/validation").exists():
             run(
                 "record",
@@ -129,7 +135,7 @@ class Thesis:
                 f"--validation_annotations={SENTENCES}",
                 "--variety=0.3",
                 "--seed=0",
-                f"--workers={o.workers}",
+                f"--workers={workers}",
                 f"--output_dir={data / 'chains'}",
             )
         if not (data / "lerobot/meta/info.json").exists():

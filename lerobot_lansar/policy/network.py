@@ -36,7 +36,7 @@ from torch import Tensor, nn
 from .cache import CacheView, KeyValueCache, token_count
 
 PACKED = 8
-"""Timesteps whose few tokens attend as one sequence in training: a GPU's attention kernels work on tiles of 64 tokens."""
+"""Timesteps whose few tokens attend as one sequence on a GPU in training: its attention kernels work on tiles of 64."""
 CONTRAST_TEMPERATURE = 0.07  # CLIP's initial temperature
 
 

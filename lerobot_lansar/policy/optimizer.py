@@ -79,8 +79,8 @@ class BatchedMuon(torch.optim.Muon):
     """
 
     @torch.no_grad()
-    def step(self, closure: Any = None) -> None:
-        """One update."""
+    def step(self, closure: Any = None) -> Tensor | None:  # type: ignore[override]
+        """One update. `closure` is not used: `Muon` calls it."""
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
             if not parameters:
@@ -102,6 +102,7 @@ class BatchedMuon(torch.optim.Muon):
                 torch._foreach_add_(
                     [parameters[i] for i in places], list(steps.to(stacked.dtype)), alpha=-size * group["lr"]
                 )
+        return None
 
 
 def orthogonalise(matrices: Tensor, coefficients: tuple[float, float, float], steps: int, eps: float) -> Tensor:
