@@ -20,6 +20,10 @@ Range = tuple[float, float]
 Color = Sequence[float]
 
 BLOCK_COLORS = {"red": (0.92, 0.12, 0.12), "blue": (0.12, 0.20, 0.92), "pink": (0.95, 0.25, 0.85)}
+CABINET_FLOOR = 0.441
+"""Height of the cabinet's floor (m): 1 mm above the table, as in CALVIN. The benchmark's blocks start lying on it."""
+DRAWER_FLOOR = 0.02236
+"""Height of the drawer's floor in its own frame (m), CALVIN's."""
 WHITE, BLACK, FLOOR = (1.0, 1.0, 1.0), (0.08, 0.08, 0.08), (0.78, 0.80, 0.83)
 
 
@@ -165,7 +169,7 @@ def _desk(scene: Scene, folder: Path) -> str:
         _link("drawer_link", 4.2313, _drawer(scene)),
         _link("led_link", 0.204, _shape('<box size="0.158 0.038 0.014"/>', WHITE)),
         _link("light_link", 0.1739, _shape('<sphere radius="0.027"/>', WHITE)),
-        _link("plank_link", 2.8438, _box(scene.cabinet, (0.02, 0.16), (0.42, 0.44), scene.dark_wood)),
+        _link("plank_link", 2.8438, _box(scene.cabinet, (0.02, 0.16), (0.42, CABINET_FLOOR), scene.dark_wood)),
     ]
     return _robot_document(f"desk_{scene.name}", *links, *joints)
 
@@ -219,7 +223,7 @@ def _drawer(scene: Scene) -> str:
             _box((-0.2015, 0.2015), (0.038, 0.0609), inside, wood),
             _box((-0.2015, -0.1769), (-0.1574, 0.038), inside, wood),
             _box((0.1769, 0.2015), (-0.1574, 0.038), inside, wood),
-            _box((-0.1769, 0.1769), (-0.1574, 0.038), (0.0, 0.0214), wood),
+            _box((-0.1769, 0.1769), (-0.1574, 0.038), (0.0, DRAWER_FLOOR), wood),
             _box((-0.1206, -0.0959), (-0.2612, -0.182), (0.0196, 0.0618), metal),
             _box((0.0959, 0.1206), (-0.2612, -0.182), (0.0196, 0.0618), metal),
             _box((-0.0959, 0.0959), (-0.2612, -0.2383), (0.0196, 0.0601), metal),

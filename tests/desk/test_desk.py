@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from lerobot_lansar.benchmark import load_chains
 from lerobot_lansar.calvin import BLOCKS, BULB, BUTTON, COLORS, LED, SWITCH, TASKS
 from lerobot_lansar.desk import SCENES, Desk, DeskError
+from lerobot_lansar.desk.oracle import PLANK, TABLE
 from lerobot_lansar.desk.robot import HOME_JOINTS
 from lerobot_lansar.desk.scenes import BLOCK_SIDE, BUTTON_Y, SWITCH_TRAVEL, TABLE_Z
 from lerobot_lansar.desk.starts import sample_start
@@ -115,6 +117,16 @@ def test_a_reset_uses_joints_and_opening_width_and_ignores_the_tcp_pose(desk):
     np.testing.assert_allclose(obs[7:14], HOME_JOINTS, atol=1e-3)
     assert obs[6] == pytest.approx(0.06, abs=2e-3)
     np.testing.assert_allclose(obs[:3], desk.reset(None)["robot_obs"][:3], atol=1e-3)
+
+
+def test_every_block_of_the_benchmark_lies_on_something_when_the_first_command_is_given(desk):
+    """The oracle wants a block that is to be lifted to lie on its surface then, not to float above it."""
+    starts = {chain.scene_obs.tobytes(): chain for chain in load_chains()}
+    assert len(starts) == 192
+    for chain in starts.values():
+        desk.reset(chain.robot_obs, chain.scene_obs)
+        for block in desk.snapshot().blocks.values():
+            assert block.contacts == {PLANK if block.position[1] > 0 else TABLE}
 
 
 @pytest.mark.parametrize("task", TASKS)

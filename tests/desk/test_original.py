@@ -90,6 +90,24 @@ def test_the_built_in_desk_has_the_originals_joints_and_extents(golden, scene):
             np.testing.assert_allclose(axes @ info[13], joint["axis_world"], atol=1e-4)
 
 
+@pytest.mark.parametrize("scene", SCENES)
+def test_blocks_come_to_rest_as_high_on_the_built_in_desk_as_on_the_original(original_assets, scene):
+    areas, drawer_x = SCENES[scene].areas, SCENES[scene].drawer_x
+    cabinet = np.mean(areas["slider_left"].x)
+    beside = np.mean(areas["slider_right"].x)
+    poses = [
+        [x, y, z, 0, 0, 1.57] for x, y, z in ((cabinet, 0.09, 0.464), (beside, 0.09, 0.464), (drawer_x, -0.28, 0.37))
+    ]
+    heights = []
+    for assets in (None, original_assets):
+        with Desk(scene, assets, cameras=()) as desk:
+            obs = desk.reset(None, [0, 0.22, 0, 0, 0, 0, *np.ravel(poses)])
+            for _ in range(60):
+                obs = desk.step([*obs["robot_obs"][:6], 1], "abs")
+            heights.append(obs["scene_obs"][BLOCKS].reshape(3, 6)[:, 2])
+    np.testing.assert_allclose(*heights, atol=1e-4)
+
+
 def test_all_initial_states_are_reached(golden, original_assets):
     states = np.load(golden / "initial_states.npz")
     with Desk("D", original_assets, cameras=()) as desk:
