@@ -34,7 +34,7 @@ SHARES = {"record": 0.2, "evaluate": 0.25}
 START_UP = 100
 """Seconds of a training that are no updates: imports, reading the data, compiling, the checkpoint."""
 RECORDERS = 0.75
-"""Share of the cores that record; the others compile meanwhile, which takes minutes if they are busy."""
+"""Share of the cores that record; the others compile meanwhile, which takes far longer on busy ones."""
 # Pictures (the rows "Baseline" and "No Space") would need lansar-record's cameras and lansar-convert
 # --embed=true here, and configs/thesis/baseline.yaml below.
 THESIS = [
