@@ -2,15 +2,20 @@
 
     python benchmarks/demonstrations.py [--starts=200] [--scenes='[A,B,C,D]'] [--assets=DIR] [--workers=2] \
         [--interrupt=true] [--output=FILE.json]
+    python benchmarks/demonstrations.py --chains=1000 [--assets=DIR] [--workers=2]
 
 Prints a Markdown table of success rates (the oracle's verdict) and mean lengths. With `--interrupt`, each start is a
 takeover in the middle of the task, see `lerobot_lansar/demos/interrupted.py`. Results in FILE that come from the same
 code and options are kept and not measured again.
+
+With `--chains`, the demonstrator plays the long-horizon benchmark instead, as a policy does: each command begins in the
+step in which the one before was fulfilled. That bounds what can be learned from its demonstrations.
 """
 
 import hashlib
 import json
 import multiprocessing
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,10 +24,12 @@ import numpy as np
 from tqdm import tqdm
 
 import lerobot_lansar
-from lerobot_lansar.calvin import SCENE_NAMES, TASKS
-from lerobot_lansar.demos.demonstrator import demonstrate
+from lerobot_lansar.benchmark import load_chains
+from lerobot_lansar.calvin import CHAIN_LENGTH, SCENE_NAMES, STEPS_PER_COMMAND, TASKS
+from lerobot_lansar.demos.demonstrator import carry_out, demonstrate
 from lerobot_lansar.demos.interrupted import finishes, interrupt
-from lerobot_lansar.desk import Desk, SimulationError
+from lerobot_lansar.demos.skills import SKILLS
+from lerobot_lansar.desk import Desk, Observation, SimulationError, is_fulfilled
 
 SEED = 1_000_000
 
@@ -38,6 +45,8 @@ class Options:
     assets: str | None = None
     # Interrupt the demonstrator, disturb the desk, and count whether another demonstrator finishes.
     interrupt: bool = False
+    # The first so many chains of the benchmark instead, on desk D.
+    chains: int = 0
     workers: int = 2
     output: Path | None = None
 
@@ -66,6 +75,58 @@ def _finish(desk: Desk, task: str, rng: np.random.Generator) -> int:
     return finishes(desk, task, takeover, rng) if takeover.feasible else -1
 
 
+def play_chains(job: tuple[range, str | None]) -> list[tuple[str, ...]]:
+    """The commands that the demonstrator came to in each chain; one that it did not fulfil is followed by `""`."""
+    numbers, assets = job
+    played = []
+    with Desk("D", assets, cameras=()) as desk:
+        for number in numbers:
+            chain, rng = load_chains()[number], np.random.default_rng([SEED, number])
+            commands: list[str] = []
+            before, obs = None, desk.reset(chain.robot_obs, chain.scene_obs)
+            for task in chain.tasks:
+                commands.append(task)
+                before, obs = _command(desk, task, before, obs, rng)
+                if before is None:
+                    commands.append("")
+                    break
+            played.append(tuple(commands))
+    return played
+
+
+def _command(
+    desk: Desk, task: str, before: Observation | None, obs: Observation, rng: np.random.Generator
+) -> tuple[Observation | None, Observation]:
+    """Carries out a command of a chain; the last two observations, the first of them None if it was not fulfilled."""
+    start, begun, left = desk.snapshot(), obs, STEPS_PER_COMMAND
+    while left:
+        began = left
+        frames = carry_out(desk, obs, SKILLS[task], rng, start=begun, before=before, variety=0.3, steps=left)
+        for frame, after, snapshot in frames:
+            before, obs, left = frame, after, left - 1
+            if is_fulfilled(task, start, snapshot):
+                return before, obs
+        if left == began:  # the skill knows nothing to do
+            break
+    return None, obs
+
+
+def report_chains(options: Options) -> None:
+    """Plays the chains and prints the average length and what failed after what."""
+    jobs = [(range(first, min(first + 5, options.chains)), options.assets) for first in range(0, options.chains, 5)]
+    played: list[tuple[str, ...]] = []
+    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
+        for some in tqdm(pool.imap_unordered(play_chains, jobs), total=len(jobs), unit="5 chains"):
+            played += some
+    lengths = np.array([len(commands) - 2 if commands[-1] == "" else CHAIN_LENGTH for commands in played])
+    rates = " | ".join(f"{100 * np.mean(lengths >= n):.1f}" for n in range(1, CHAIN_LENGTH + 1))
+    print("| 1 (%) | 2 (%) | 3 (%) | 4 (%) | 5 (%) | average length |\n|" + " ---: |" * (CHAIN_LENGTH + 1))
+    print(f"| {rates} | {lengths.mean():.3f} |\n")
+    failed = Counter(commands[-3:-1] for commands in played if commands[-1] == "")
+    for commands, count in failed.most_common():
+        print(f"{count} x {' then '.join(commands)}")
+
+
 def code_and_options(options: Options) -> str:
     """A hash of the code and the options that decide the results."""
     package = Path(lerobot_lansar.__file__).parent
@@ -78,6 +139,9 @@ def code_and_options(options: Options) -> str:
 def main() -> None:
     """Measures what FILE does not hold yet and prints the table."""
     options = draccus.parse(Options)
+    if options.chains:
+        report_chains(options)
+        return
     state = code_and_options(options)
     known: dict[str, list[int]] = {}
     if options.output is not None and options.output.exists():

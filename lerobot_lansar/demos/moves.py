@@ -154,8 +154,7 @@ class View:
 
     def holds(self, color: str) -> bool:
         """Whether the closed hand has the block between its fingers."""
-        near = np.linalg.norm(self.block(color)[:3] - self.tcp) < 0.045
-        return bool(near and self.robot_obs[GRIPPER_ACTION] < 0 and self.robot_obs[GRIPPER_WIDTH] > 0.02)
+        return color == self.held()
 
     def lost(self, color: str) -> bool:
         """Whether the block fell off the desk."""
@@ -170,8 +169,11 @@ class View:
         return bool(0.03 < way[2] < height and np.linalg.norm(way[:2]) < 0.05)
 
     def held(self) -> str | None:
-        """The block in the hand, if any."""
-        return next((color for color in COLORS if self.holds(color)), None)
+        """The block between the fingers of the closed hand, if any: the nearest one."""
+        away = {color: float(np.linalg.norm(self.block(color)[:3] - self.tcp)) for color in COLORS}
+        nearest = min(COLORS, key=away.__getitem__)
+        closed = self.robot_obs[GRIPPER_ACTION] < 0 and self.robot_obs[GRIPPER_WIDTH] > 0.02
+        return nearest if closed and away[nearest] < 0.045 else None
 
     def scatter(self, spread: float) -> float:
         """A random number within +-`spread` (m or rad), scaled by the style's own spread."""
@@ -285,6 +287,22 @@ def half_width(view: View, color: str, direction: np.ndarray) -> float:
     return float(length * along + BLOCK_SIDE * across) / 2
 
 
+def half_height(view: View, color: str, turn: Rotation | None = None) -> float:
+    """Half of a block's vertical extent (m), after turning it by `turn`."""
+    orientation = Rotation.from_euler("xyz", view.block(color)[3:])
+    axes = (orientation if turn is None else turn * orientation).as_matrix()
+    return float(np.abs(axes[2]) @ [view.length(color), BLOCK_SIDE, BLOCK_SIDE]) / 2
+
+
+def _finger_meets(other: np.ndarray, pose: np.ndarray, yaw: float) -> bool:
+    """Whether an open finger of a hand with that yaw, around the block at `pose`, would come down on another block."""
+    if abs(other[2] - pose[2]) > 0.03:
+        return False
+    apart = 0.05 * np.array([np.sin(yaw), -np.cos(yaw)])
+    reach = BLOCK_SIDE / 2 + 0.015
+    return any(bool(np.linalg.norm(other[:2] - pose[:2] - side * apart) < reach) for side in (1, -1))
+
+
 def grasp_yaws(view: View, color: str) -> list[float]:
     """Yaws (rad) at which the fingers can close on a block, the most convenient first; only those in `YAWS`.
 
@@ -300,6 +318,7 @@ def grasp_yaws(view: View, color: str) -> list[float]:
         # the hand is 0.2 m wide across its fingers: near the cabinet it must stay parallel to it
         sideways = abs(np.sin(candidate - FORWARD)) * (3.0 if pose[1] > -0.10 else 0.5)
         long_side = 0.5 * (horizontal and abs(np.sin(candidate - yaw)) > 0.5 and view.length(color) > BLOCK_SIDE)
-        return abs(candidate - now) + sideways + long_side
+        blocked = 2.0 * any(_finger_meets(other, pose, candidate) for other in view.others(color))
+        return abs(candidate - now) + sideways + long_side + blocked
 
     return sorted((y for y in yaws if YAWS[0] <= y <= YAWS[1]), key=inconvenience)

@@ -104,7 +104,7 @@ def _play(
     left, carried_out = frames, 0
     before: str | None = None
     while left > 0:
-        feasible = feasible_tasks(desk.scene, last, obs)
+        feasible = feasible_tasks(desk.scene, last, obs, before)
         task = choose_task(feasible, before, rng, weights) if feasible else None
         if task is not None:
             unit.tried[task] = unit.tried.get(task, 0) + 1
@@ -156,21 +156,27 @@ def _color_and_side(task: Task) -> tuple[int, str]:
     return COLORS.index(task.color) if task.color is not None else 0, task.side or ""
 
 
-def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation) -> list[Task]:
-    """The tasks that can begin now, by CALVIN's rules (a block in the hand can only be placed or stacked) and by what
-    a hand can reach.
+def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation, before: str | None = None) -> list[Task]:
+    """The tasks that can begin now, by CALVIN's rules and by what a hand can reach.
+
+    A block in the hand can only be placed or stacked, but for the upper block of a stack: unstacking ends with it in
+    the hand, and the benchmark goes on as if it lay on the table.
 
     Args:
         scene: The desk's scene.
         snapshot, obs: The present state.
+        before: The task that has just been fulfilled, if any.
     """
     view = View(scene, obs["robot_obs"], obs["scene_obs"], np.random.default_rng(0), Style())
     held = next((color for color, block in snapshot.blocks.items() if block.bodies == {"robot"}), None)
-    if held is None:
-        return [task for task in TASKS.values() if _is_feasible(task, view, snapshot)]
-    if not view.holds(held):
+    if held is not None and not view.holds(held):
         return []  # the block hangs on the hand, but not between the fingers
-    return [task for task in TASKS.values() if _is_feasible_holding(task, held, view, snapshot)]
+    tasks = []
+    if held is not None:
+        tasks += [task for task in TASKS.values() if _is_feasible_holding(task, held, view, snapshot)]
+    if held is None or before == "unstack_block":
+        tasks += [task for task in TASKS.values() if _is_feasible(task, view, snapshot)]
+    return tasks
 
 
 def _is_feasible_holding(task: Task, held: str, view: View, snapshot: Snapshot) -> bool:

@@ -241,7 +241,7 @@ class Session:
         self._target = self._obs["robot_obs"][TCP_POSE].copy()  # what relative actions move, as in `Desk.step`
         before: str | None = None
         for _ in range(CHAIN_LENGTH):
-            feasible = feasible_tasks(self._desk.scene, self._last, self._obs)
+            feasible = feasible_tasks(self._desk.scene, self._last, self._obs, before)
             if not feasible or not self._left:
                 return
             before = task = choose_task(feasible, before, rng, self._config.weights)

@@ -14,14 +14,21 @@ from xml.etree import ElementTree
 
 import pybullet_data
 
-from .scenes import BLOCK_LENGTHS, BLOCK_SIDE, BUTTON_TRAVEL, BUTTON_Y, DRAWER_TRAVEL, SWITCH_TRAVEL, Scene
+from .scenes import (
+    BLOCK_LENGTHS,
+    BLOCK_SIDE,
+    BUTTON_TRAVEL,
+    BUTTON_Y,
+    CABINET_FLOOR,
+    DRAWER_TRAVEL,
+    SWITCH_TRAVEL,
+    Scene,
+)
 
 Range = tuple[float, float]
 Color = Sequence[float]
 
 BLOCK_COLORS = {"red": (0.92, 0.12, 0.12), "blue": (0.12, 0.20, 0.92), "pink": (0.95, 0.25, 0.85)}
-CABINET_FLOOR = 0.441
-"""Height of the cabinet's floor (m): 1 mm above the table, as in CALVIN. The benchmark's blocks start lying on it."""
 DRAWER_FLOOR = 0.02236
 """Height of the drawer's floor in its own frame (m), CALVIN's."""
 WHITE, BLACK, FLOOR = (1.0, 1.0, 1.0), (0.08, 0.08, 0.08), (0.78, 0.80, 0.83)

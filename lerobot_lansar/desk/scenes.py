@@ -15,6 +15,8 @@ BLOCK_SIDE = 0.04
 
 TABLE_Z = 0.46
 """Height of a block's centre on the table (m); on the cabinet's floor it is 1 mm more."""
+CABINET_FLOOR = 0.441
+"""Height of the cabinet's floor (m): 1 mm above the table, as in CALVIN. The benchmark's blocks start lying on it."""
 DRAWER_Z = 0.362
 """Height of a block's centre in the drawer (m)."""
 REACH = 0.41

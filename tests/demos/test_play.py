@@ -118,6 +118,15 @@ def test_a_sampled_start_of_a_task_is_feasible_in_play(task):
     assert feasible >= 3
 
 
+def test_after_unstacking_the_benchmarks_other_commands_are_feasible_with_the_block_in_the_hand():
+    with Desk("D", cameras=()) as desk:
+        obs = desk.reset(*sample_start(desk, "place_in_drawer", np.random.default_rng(0)))
+        holding = feasible_tasks(desk.scene, desk.snapshot(), obs, before="lift_red_block_table")
+        unstacked = feasible_tasks(desk.scene, desk.snapshot(), obs, before="unstack_block")
+    assert {task.kind for task in holding} <= {"place_block", "stack_block"}
+    assert {"place_block", "close_drawer"} <= {task.kind for task in unstacked}
+
+
 def test_windows_end_after_the_task_and_name_no_other():
     with Desk("D", cameras=()) as desk:
         obs = desk.reset()["scene_obs"].copy()

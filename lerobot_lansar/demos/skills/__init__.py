@@ -11,7 +11,7 @@ furniture    drawer, door, switch and button
 from collections.abc import Callable, Iterator
 
 from ...calvin import TASKS, Task
-from ..moves import Skill, View, Waypoint
+from ..moves import Skill, View, Waypoint, on_table
 from . import blocks, furniture, table
 
 
@@ -44,17 +44,37 @@ def _order(task: Task) -> tuple[int, bool]:
 
 
 def _with_free_hand(task: Task) -> Skill:
-    """The task's skill, which first puts down a block that the task is not about."""
+    """The task's skill, which first lets go of a block that the task is not about.
+
+    A command ends as soon as it is fulfilled, often with a block still in the hand or between the open fingers.
+    """
     skill = _BY_KIND[task.kind](task)
 
     def freed(view: View) -> Iterator[Waypoint]:
+        wanted = _wanted(task, view)
         held = view.held()
-        wanted = {task.color, view.start.held(), blocks.top_of_stack(view.start)}
-        if held is not None and held not in wanted and task.kind != "push_into_drawer":
-            yield from blocks.put_down(view)
+        if held is None:
+            yield from blocks.leave(view, but=wanted)
+        elif held != wanted:
+            yield from blocks.let_go(view, held)
         yield from skill(view)
 
     return freed
+
+
+def _wanted(task: Task, view: View) -> str | None:
+    """The block that the hand takes first, or already has, to do the task."""
+    match task.kind:
+        case "place_block" | "stack_block":
+            return view.start.held()
+        case "unstack_block":
+            return blocks.top_of_stack(view.start)
+        case "push_into_drawer":
+            held = view.held()
+            return held if held is not None and on_table(view.start.block(held)) else None
+        case "lift_block" | "rotate_block" | "push_block":
+            return task.color
+    return None
 
 
 SKILLS: dict[str, Skill] = {task.name: _with_free_hand(task) for task in sorted(TASKS.values(), key=_order)}

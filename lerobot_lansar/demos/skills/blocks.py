@@ -5,9 +5,10 @@ from functools import partial
 from itertools import permutations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ...calvin import COLORS
-from ...desk.scenes import BLOCK_SIDE, BUTTON_Y, DOOR_WIDTH, DRAWER_Z, TABLE_Z
+from ...calvin import COLORS, GRIPPER_WIDTH
+from ...desk.scenes import BLOCK_SIDE, BUTTON_Y, CABINET_FLOOR, DOOR_WIDTH, DRAWER_Z, TABLE_Z
 from ..moves import (
     CLOSED,
     FORWARD,
@@ -21,6 +22,7 @@ from ..moves import (
     Waypoint,
     approach,
     grasp_yaws,
+    half_height,
     in_cabinet,
     lying,
     on_table,
@@ -44,10 +46,8 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
         lean = 0.0
         if position[1] > 0.02:  # behind the door
             # beside the wall or the door's edge the hand stays farther inside than its fingertips
-            low, high = _finger_room(view, position[0])
-            beyond = position[0] - np.clip(position[0], low, high)
-            lean = float(np.clip(10 * beyond, -0.3, 0.3))
-            position[0] -= np.clip(beyond, -0.012, 0.012)
+            low, high = _finger_room(view, open_part(view, position[0]))
+            lean = float(np.clip(10 * (position[0] - np.clip(position[0], low, high)), -0.3, 0.3))
         deep = np.clip(position[1] - 0.085, 0.0, 0.04)  # so deep inside the hand itself would touch the door
         position[1] -= 0.3 * deep
         # a leaning hand that is also turned has one finger lower than the other: turn it half as far as the block
@@ -61,15 +61,14 @@ def _hold(view: View, color: str, yaw: float) -> tuple[np.ndarray, np.ndarray]:
     return position, pointing(yaw, *stretch(position))
 
 
-def _finger_room(view: View, x: float) -> tuple[float, float]:
-    """Range of x (m) in which an open hand fits into the cabinet.
+def _finger_room(view: View, part: tuple[float, float]) -> tuple[float, float]:
+    """Range of x (m) in which an open hand fits into that part of the cabinet.
 
-    It needs 0.067 m to either side for its fingers, beside a wall, and 0.095 m for the hand itself, beside the door.
+    It needs 0.075 m to either side for its fingers, beside a wall, and 0.095 m for the hand itself, beside the door.
     """
-    low, high = open_part(view, x)
     left, right = view.scene.cabinet
-    low += 0.075 if low == left else 0.095
-    high -= 0.075 if high == right else 0.095
+    low = part[0] + (0.075 if part[0] == left else 0.095)
+    high = part[1] - (0.075 if part[1] == right else 0.095)
     middle = (low + high) / 2
     return min(low, middle), max(high, middle)
 
@@ -88,7 +87,7 @@ def take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
         position, euler = _hold(view, color, yaw)
         yield view.go(position - 0.03 * approach(euler), OPEN, euler, slow=0.9, tolerance=0.01)
     position, euler = _hold(view, color, yaw)
-    yield view.go(position, OPEN, euler, slow=0.7, tolerance=0.006)
+    yield view.go(position, OPEN, euler, slow=0.7, tolerance=0.012)
     yield view.go(view.tcp.copy(), CLOSED, euler, hold=4, tolerance=0.02)
 
 
@@ -153,6 +152,17 @@ def set_down_from_above(view: View, color: str, place: np.ndarray, yaw: float, h
     return _set_down(view, color, [(above, 0.9, 0.008), (place, 0.7, 0.008)], pointing(yaw, *stretch(place)))
 
 
+def _as_held(view: View, color: str, euler: np.ndarray) -> tuple[np.ndarray, float]:
+    """How the block in the hand hangs from a hand with that `euler`, which may lean or be turned otherwise than now.
+
+    Returns:
+        Position of its centre relative to the TCP (3,) m, and half of its vertical extent (m).
+    """
+    turn = Rotation.from_euler("xyz", euler) * Rotation.from_euler("xyz", view.euler).inv()
+    pose = view.block(color)
+    return turn.apply(pose[:3] - view.tcp), half_height(view, color, turn)
+
+
 def landing(view: View, color: str, xs: np.ndarray) -> np.ndarray:
     """A free place (2,) m on the table with x among `xs`, as near to the block as possible."""
     pose, radius = view.block(color), view.length(color) / 2
@@ -177,6 +187,32 @@ def put_down(view: View) -> Iterator[Waypoint]:
     else:
         place = np.array([*landing(view, color, np.arange(-0.3, 0.36, 0.03)), TABLE_Z + 0.012])
         yield from set_down_from_above(view, color, place, view.yaw, 0.55)
+
+
+def let_go(view: View, color: str) -> Iterator[Waypoint]:
+    """Opens the hand where the held block stands, or puts the block down on the table if it stands on nothing."""
+    if not _stands(view, color):
+        yield from put_down(view)
+        return
+    yield view.go(view.tcp.copy(), OPEN, view.euler, tolerance=0.02, hold=4)
+    yield from leave(view)
+
+
+def leave(view: View, but: str | None = None) -> Iterator[Waypoint]:
+    """Raises the open hand from around a block other than `but`, which it would take along if it closed."""
+    around = [color for color in COLORS if np.linalg.norm(view.block(color)[:3] - view.tcp) < 0.06]
+    if around and but not in around and view.robot_obs[GRIPPER_WIDTH] > 0.02:
+        yield view.go(view.tcp - 0.1 * approach(view.euler), OPEN, view.euler, tolerance=0.02)
+
+
+def _stands(view: View, color: str) -> bool:
+    """Whether a block stands on the table or on another block, to within 0.01 m."""
+    pose = view.block(color)
+    bottom = pose[2] - half_height(view, color)
+    tops = [view.block(c)[2] + half_height(view, c) for c in COLORS if c != color and view.lies_on(color, c)]
+    if -0.20 < pose[1] < 0.02:
+        tops.append(TABLE_Z - BLOCK_SIDE / 2)
+    return any(abs(bottom - top) < 0.01 for top in tops)
 
 
 def _carrying(carry: Callable[[View, str], Iterator[Waypoint]]) -> Skill:
@@ -212,18 +248,17 @@ place_in_drawer = _carrying(into_drawer)
 
 @_carrying
 def place_in_slider(view: View, color: str) -> Iterator[Waypoint]:
-    """Carry the block in front of the cabinet's open part, reach in with a leaning hand and let go."""
-    low, high = open_part(view)
-    middle, room = (low + high) / 2, max((high - low) / 2 - 0.07, 0.0)
-    places = [np.array([middle + s * room, 0.088, 0.0]) for s in (0.0, 0.5, -0.5, 1.0, -1.0)]
-    x = _freest(view, color, places)[0]
-    x = float(np.clip(x + view.scatter(0.01), middle - room, middle + room))
-    before = np.array([x, -0.10, 0.60])
-    inside = np.array([x, 0.082, 0.525])
-    way = [(before, 1.0, 0.015), (inside, 0.9, 0.01), (np.array([x, 0.088, 0.480]), 0.7, 0.008)]
+    """Carry the block in front of the cabinet's open part, reach in with a leaning hand and let it drop."""
+    low, high = _finger_room(view, open_part(view))
+    places = [np.array([low + share * (high - low), 0.086, 0.0]) for share in (0.5, 0.75, 0.25, 1.0, 0.0)]
+    x = float(np.clip(_freest(view, color, places)[0] + view.scatter(0.01), low, high))
     # the long side of the block points inwards
     yaw = FORWARD + float(np.clip(view.yaw - FORWARD, -0.3, 0.3))
-    yield from _set_down(view, color, way, pointing(yaw, 0.0, INTO_CABINET))
+    euler = pointing(yaw, 0.0, INTO_CABINET)
+    hang, half = _as_held(view, color, euler)
+    inside = np.array([x, 0.086, CABINET_FLOOR + half - hang[2] + 0.012])
+    way = [(np.array([x, -0.10, 0.60]), 1.0, 0.015), (inside, 0.8, 0.012)]
+    yield from _set_down(view, color, way, euler)
 
 
 def open_part(view: View, x: float | None = None) -> tuple[float, float]:
@@ -256,11 +291,8 @@ def stack_block(view: View, color: str) -> Iterator[Waypoint]:
     yaws = [turned(lying(below)[0] + k * np.pi / 2) for k in range(4)]
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw <= YAWS[1]]
     yaw = min(yaws, key=lambda y: abs(y - now) + 2 * abs(np.sin(y - FORWARD)))
-    # the block may not be centred between the fingers
-    hang = view.block(color)[:3] - view.tcp
+    hang, _ = _as_held(view, color, pointing(yaw, *stretch(below[:3])))
     place = below[:3] - [hang[0], hang[1], 0.0] + [0.0, 0.0, BLOCK_SIDE + 0.006 - min(hang[2], 0.0)]
-    if abs(yaw - now) > 0.3:  # its offset turns with the hand
-        place[:2] = below[:2]
     yield from set_down_from_above(view, color, place, yaw, 0.57)
 
 
