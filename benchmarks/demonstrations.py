@@ -25,11 +25,10 @@ from tqdm import tqdm
 
 import lerobot_lansar
 from lerobot_lansar.benchmark import load_chains
-from lerobot_lansar.calvin import CHAIN_LENGTH, SCENE_NAMES, STEPS_PER_COMMAND, TASKS
-from lerobot_lansar.demos.demonstrator import carry_out, demonstrate
+from lerobot_lansar.calvin import CHAIN_LENGTH, SCENE_NAMES, TASKS
+from lerobot_lansar.demos.demonstrator import demonstrate, fulfil
 from lerobot_lansar.demos.interrupted import finishes, interrupt
-from lerobot_lansar.demos.skills import SKILLS
-from lerobot_lansar.desk import Desk, Observation, SimulationError, is_fulfilled
+from lerobot_lansar.desk import Desk, SimulationError
 
 SEED = 1_000_000
 
@@ -86,29 +85,12 @@ def play_chains(job: tuple[range, str | None]) -> list[tuple[str, ...]]:
             before, obs = None, desk.reset(chain.robot_obs, chain.scene_obs)
             for task in chain.tasks:
                 commands.append(task)
-                before, obs = _command(desk, task, before, obs, rng)
-                if before is None:
+                fulfilled, obs, before = fulfil(desk, obs, task, rng, before=before, variety=0.3)
+                if not fulfilled:
                     commands.append("")
                     break
             played.append(tuple(commands))
     return played
-
-
-def _command(
-    desk: Desk, task: str, before: Observation | None, obs: Observation, rng: np.random.Generator
-) -> tuple[Observation | None, Observation]:
-    """Carries out a command of a chain; the last two observations, the first of them None if it was not fulfilled."""
-    start, begun, left = desk.snapshot(), obs, STEPS_PER_COMMAND
-    while left:
-        began = left
-        frames = carry_out(desk, obs, SKILLS[task], rng, start=begun, before=before, variety=0.3, steps=left)
-        for frame, after, snapshot in frames:
-            before, obs, left = frame, after, left - 1
-            if is_fulfilled(task, start, snapshot):
-                return before, obs
-        if left == began:  # the skill knows nothing to do
-            break
-    return None, obs
 
 
 def report_chains(options: Options) -> None:

@@ -99,6 +99,40 @@ def carry_out(
                 break
 
 
+def fulfil(
+    desk: Desk,
+    obs: Observation,
+    task: str,
+    rng: np.random.Generator,
+    *,
+    before: Observation | None = None,
+    variety: float = 1.0,
+    noise: float = 0.2,
+) -> tuple[bool, Observation, Observation]:
+    """Carries out a task as a command of the benchmark: up to the step in which it is fulfilled, or for 360 steps.
+
+    Args:
+        desk, obs, rng, before, variety, noise: As for `carry_out`.
+        task: One of `SKILLS`.
+
+    Returns:
+        Whether it was fulfilled; the observations after the last step and before it.
+    """
+    start, begun, earlier, left = desk.snapshot(), obs, before, STEPS_PER_COMMAND
+    while left:
+        began = left
+        frames = carry_out(
+            desk, obs, SKILLS[task], rng, start=begun, before=earlier, variety=variety, noise=noise, steps=left
+        )
+        for frame, after, snapshot in frames:
+            earlier, obs, left = frame, after, left - 1
+            if is_fulfilled(task, start, snapshot):
+                return True, obs, earlier
+        if left == began:  # the skill sees nothing to do
+            break
+    return False, obs, obs if earlier is None else earlier
+
+
 def demonstrate(
     desk: Desk, task: str, rng: np.random.Generator, noise: float = 0.2, variety: float = 1.0
 ) -> Demonstration | None:
