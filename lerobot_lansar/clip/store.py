@@ -70,12 +70,6 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_description(root: Path) -> dict[str, Any] | None:
-    """The contents of `clip.json`; None if there is none."""
-    file = clip_dir(root) / _DESCRIPTION
-    return json.loads(file.read_text()) if file.is_file() else None
-
-
 def load_embeddings(root: Path, total_frames: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The dataset's CLIP embeddings.
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import pybullet as p
 
-from ..calvin import CAMERAS
 from ..cameras import FIELD_OF_VIEW, STATIC_EYE, STATIC_TARGET, STATIC_UP
 
 
@@ -14,20 +13,18 @@ class Intrinsics:
     """How a camera sees.
 
     Attributes:
-        size: Width and height of its pictures, pixels.
         fov: Vertical field of view, degrees.
         near, far: Clip planes: what is nearer or farther is not drawn, m.
     """
 
-    size: int
     fov: float
     near: float
     far: float
 
 
 INTRINSICS = {
-    "static": Intrinsics(size=CAMERAS["static"], fov=FIELD_OF_VIEW["static"], near=0.01, far=10.0),
-    "gripper": Intrinsics(size=CAMERAS["gripper"], fov=FIELD_OF_VIEW["gripper"], near=0.01, far=2.0),
+    "static": Intrinsics(fov=FIELD_OF_VIEW["static"], near=0.01, far=10.0),
+    "gripper": Intrinsics(fov=FIELD_OF_VIEW["gripper"], near=0.01, far=2.0),
 }
 
 

@@ -87,7 +87,6 @@ class Block:
 
     def __init__(self, client: int, assets: Assets, color: str):
         self.client = client
-        self.color = color
         self.body = p.loadURDF(str(assets.blocks[color]), globalScaling=assets.scale, physicsClientId=client)
 
     def place(self, position: Any, euler: Any) -> None:

@@ -42,7 +42,7 @@ class BulletRenderer:
         self._shown: Colors = {}
         if plugin is not None:  # the plugin's first two pictures have no shadow
             for _ in range(2):
-                self.draw(Intrinsics(16, 60.0, 0.1, 10.0), np.eye(4), 16, {})
+                self.draw(Intrinsics(60.0, 0.1, 10.0), np.eye(4), 16, {})
 
     def draw(
         self, intrinsics: Intrinsics, view: np.ndarray, size: int, colors: Colors, fixed: bool = False
