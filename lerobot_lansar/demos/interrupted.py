@@ -18,7 +18,7 @@ from ..desk.starts import sample_start
 from .demonstrator import AFTERWARDS, carry_out
 from .moves import FALLEN, View, lying, on_table
 from .skills import SKILLS
-from .skills.blocks import best_base
+from .skills.blocks import best_base, has_shelf_room
 
 DISTURBANCES = ("none", "wander", "grip", "wrong task")
 """What happens between the interruption and the takeover: nothing; up to 30 random steps; up to 30 steps in place with
@@ -112,7 +112,7 @@ def _is_feasible(task: Task, start: View, now: View, begun: Snapshot) -> bool:
     if color is not None and not _can_be_taken(now, color):
         return False
     if task.kind == "place_block" and task.place == "slider":
-        return min(now.slide, now.scene.slide_travel - now.slide) < 0.03
+        return has_shelf_room(now)
     if task.kind == "place_block":
         return now.drawer > 0.15
     if task.kind == "rotate_block":

@@ -15,7 +15,7 @@ from .calvin_folder import FrameWriter, Unit
 from .demonstrator import AFTERWARDS, Frame, carry_out
 from .moves import FALLEN, Style, View, Waypoint, lying
 from .skills import SKILLS
-from .skills.blocks import put_down
+from .skills.blocks import has_shelf_room, put_down
 
 NO_WEIGHTS: Mapping[str, float] = {}
 _SHORTEST = 32  # frames in a window, unless its recording began later
@@ -183,7 +183,7 @@ def _is_feasible_holding(task: Task, held: str, view: View, snapshot: Snapshot) 
     """Whether a task can begin with a block in the hand."""
     match task.kind, task.place:
         case "place_block", "slider":
-            return min(view.slide, view.scene.slide_travel - view.slide) < 0.03
+            return has_shelf_room(view)
         case "place_block", "drawer":
             return view.drawer > 0.15
         case "stack_block", _:
@@ -247,21 +247,27 @@ def _free_on_table(color: str, view: View, snapshot: Snapshot) -> bool:
 def whole_windows(snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]]) -> list[tuple[int, int, str]]:
     """Windows from the frame in which a task was begun until it has stayed fulfilled for `AFTERWARDS` frames.
 
-    That is what a policy does in a rollout of several subtasks: it begins where the subtask before left the desk.
+    That is what a policy does in a rollout of several subtasks: it begins where the subtask before left the desk. The
+    oracle may waver at first, for instance when a block that is being turned leaves the table for a frame.
 
     Args:
         snapshots: One per frame of one recording.
-        fulfilled: (began, frame, task): the frames in which a task was begun and first seen fulfilled.
+        fulfilled: (began, frame, task): the frames in which a task was begun and first seen fulfilled, in order.
 
     Returns:
-        (first, end, task) with an exclusive end, in order. Tasks that did not stay fulfilled give none.
+        (first, end, task) with an exclusive end, in order. Tasks that did not stay fulfilled until the next one began
+        give none.
     """
-    return [
-        (began, frame + 1 + AFTERWARDS, task)
-        for began, frame, task in fulfilled
-        if frame + AFTERWARDS < len(snapshots)
-        and all(is_fulfilled(task, snapshots[began], now) for now in snapshots[frame : frame + 1 + AFTERWARDS])
-    ]
+    windows = []
+    following = [*(began for began, _, _ in fulfilled[1:]), len(snapshots)]
+    for (began, frame, task), until in zip(fulfilled, following, strict=True):
+        lasting = 0
+        for end in range(frame, until):
+            lasting = lasting + 1 if is_fulfilled(task, snapshots[began], snapshots[end]) else 0
+            if lasting > AFTERWARDS:
+                windows.append((began, end + 1, task))
+                break
+    return windows
 
 
 def cut_windows(

@@ -32,6 +32,7 @@ from ..moves import (
     turned,
     under_way,
 )
+from .furniture import push_door
 
 EDGE = 0.415
 """|x| (m) up to which blocks are set down on the table, which ends at 0.44."""
@@ -73,11 +74,23 @@ def _finger_room(view: View, part: tuple[float, float]) -> tuple[float, float]:
     return min(low, middle), max(high, middle)
 
 
+def _make_room(view: View, color: str) -> Iterator[Waypoint]:
+    """Pushes the door away from a block in the cabinet if the hand has too little room beside it."""
+    x = view.block(color)[0]
+    low, high = _finger_room(view, open_part(view, x))
+    away = -1.0 if x > view.scene.slide_x - view.slide + DOOR_WIDTH / 2 else 1.0
+    left = view.scene.slide_travel - view.slide if away < 0 else view.slide
+    if abs(x - np.clip(x, low, high)) > 0.02 and left > 0.03:
+        yield from push_door(view, away)
+
+
 def take(view: View, color: str, turn: float = 0.0) -> Iterator[Waypoint]:
     """Moves the open hand around a block and closes it; `turn` (rad) is how far the wrist must turn afterwards."""
     yaws = grasp_yaws(view, color)
     yaws = [yaw for yaw in yaws if YAWS[0] <= yaw + turn <= YAWS[1]] or yaws
     in_there = in_cabinet(view.block(color))
+    if in_there:
+        yield from _make_room(view, color)
     yaw = yaws[0] + (0.0 if in_there else view.scatter(0.08))
     lead = 0.2 if in_there else 0.08 + abs(view.scatter(0.03))
     position, euler = _hold(view, color, yaw)
@@ -249,9 +262,7 @@ place_in_drawer = _carrying(into_drawer)
 @_carrying
 def place_in_slider(view: View, color: str) -> Iterator[Waypoint]:
     """Carry the block in front of the cabinet's open part, reach in with a leaning hand and let it drop."""
-    low, high = _finger_room(view, open_part(view))
-    places = [np.array([low + share * (high - low), 0.086, 0.0]) for share in (0.5, 0.75, 0.25, 1.0, 0.0)]
-    x = float(np.clip(_freest(view, color, places)[0] + view.scatter(0.01), low, high))
+    x = float(np.clip(_shelf_place(view, color) + view.scatter(0.01), *_finger_room(view, open_part(view))))
     # the long side of the block points inwards
     yaw = FORWARD + float(np.clip(view.yaw - FORWARD, -0.3, 0.3))
     euler = pointing(yaw, 0.0, INTO_CABINET)
@@ -259,6 +270,30 @@ def place_in_slider(view: View, color: str) -> Iterator[Waypoint]:
     inside = np.array([x, 0.086, CABINET_FLOOR + half - hang[2] + 0.012])
     way = [(np.array([x, -0.10, 0.60]), 1.0, 0.015), (inside, 0.8, 0.012)]
     yield from _set_down(view, color, way, euler)
+
+
+def _shelf_place(view: View, color: str) -> float:
+    """x (m) in the cabinet's open part where a block is put: in the middle, or else where it is farther from others.
+
+    Of two places that are nearly as good, it is the one at the wall.
+    """
+    part = open_part(view)
+    low, high = _finger_room(view, part)
+    by_wall, by_door = (low, high) if part[0] == view.scene.cabinet[0] else (high, low)
+
+    def room(x: float) -> float:
+        return min(float(np.linalg.norm(other[:2] - [x, 0.086])) for other in view.others(color))
+
+    middle = (low + high) / 2
+    if room(middle) > 0.11:
+        return middle
+    return by_wall if room(by_wall) > room(by_door) - 0.02 else by_door
+
+
+def has_shelf_room(view: View) -> bool:
+    """Whether the cabinet is open so far that a block can be put in beside the door."""
+    low, high = open_part(view)
+    return high - low > 0.17
 
 
 def open_part(view: View, x: float | None = None) -> tuple[float, float]:

@@ -48,18 +48,23 @@ def slide(direction: float) -> Skill:
     def skill(view: View) -> Iterator[Waypoint]:
         """Go beside the door's handle and push it along the cabinet."""
         for _ in range(TRIES):
-            # the handle is 0.042 m wide, centred at this x
-            handle = view.scene.slide_x + 0.14 - view.slide
-            beside = handle - direction * (0.021 + 0.05 + abs(view.scatter(0.015)))
-            end = view.scene.slide_x + 0.14 - (view.scene.slide_travel if direction < 0 else 0.0)
-            z = 0.53 + view.scatter(0.006)
-            yield from travel(view, (beside, -0.07, 0.58), view.style.idle_gripper)
-            yield view.go((beside, -0.06, 0.58), tolerance=0.02)
-            yield view.go((beside, -0.012, z), slow=0.9)
-            yield view.go((end + direction * 0.05, -0.012, z), slow=0.85)
-            yield view.go((view.tcp[0] - direction * 0.03, -0.09, 0.58))
+            yield from push_door(view, direction)
 
     return skill
+
+
+def push_door(view: View, direction: float) -> Iterator[Waypoint]:
+    """Pushes the door to its end on the left (-1) or right (+1), once, and backs off."""
+    # the handle is 0.042 m wide, centred at this x
+    handle = view.scene.slide_x + 0.14 - view.slide
+    beside = handle - direction * (0.021 + 0.05 + abs(view.scatter(0.015)))
+    end = view.scene.slide_x + 0.14 - (view.scene.slide_travel if direction < 0 else 0.0)
+    z = 0.53 + view.scatter(0.006)
+    yield from travel(view, (beside, -0.07, 0.58), view.style.idle_gripper)
+    yield view.go((beside, -0.06, 0.58), tolerance=0.02)
+    yield view.go((beside, -0.012, z), slow=0.9)
+    yield view.go((end + direction * 0.05, -0.012, z), slow=0.85)
+    yield view.go((view.tcp[0] - direction * 0.03, -0.09, 0.58))
 
 
 def _lever(view: View) -> np.ndarray:
