@@ -259,8 +259,8 @@ def whole_windows(snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str
         give none.
     """
     windows = []
-    following = [*(began for began, _, _ in fulfilled[1:]), len(snapshots)]
-    for (began, frame, task), until in zip(fulfilled, following, strict=True):
+    for number, (began, frame, task) in enumerate(fulfilled, start=1):
+        until = fulfilled[number][0] if number < len(fulfilled) else len(snapshots)
         lasting = 0
         for end in range(frame, until):
             lasting = lasting + 1 if is_fulfilled(task, snapshots[began], snapshots[end]) else 0

@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_lansar.calvin import BULB, CHAIN_LENGTH, CONTROL_HZ, LED, TASKS, WINDOW_FRAMES, relative_action
 from lerobot_lansar.demos.calvin_folder import FrameWriter
-from lerobot_lansar.demos.play import choose_task, cut_windows, feasible_tasks, record_play
+from lerobot_lansar.demos.play import choose_task, cut_windows, feasible_tasks, record_play, whole_windows
 from lerobot_lansar.demos.record import RecordConfig, record
 from lerobot_lansar.desk import Desk, completed_tasks, is_fulfilled
 from lerobot_lansar.desk.starts import sample_start
@@ -125,6 +125,20 @@ def test_after_unstacking_the_benchmarks_other_commands_are_feasible_with_the_bl
         unstacked = feasible_tasks(desk.scene, desk.snapshot(), obs, before="unstack_block")
     assert {task.kind for task in holding} <= {"place_block", "stack_block"}
     assert {"place_block", "close_drawer"} <= {task.kind for task in unstacked}
+
+
+def test_whole_windows_end_when_the_task_has_stayed_fulfilled_and_may_waver_before():
+    with Desk("D", cameras=()) as desk:
+        scene_obs, snapshots = desk.reset()["scene_obs"].copy(), []
+        for lit in (0, 0, 1, 0, 1, 1, 1, 1, 0):
+            scene_obs[LED] = lit
+            desk.reset(scene_obs=scene_obs)
+            snapshots.append(desk.snapshot())
+    assert whole_windows(snapshots, []) == []
+    assert whole_windows(snapshots, [(0, 2, "turn_on_led")]) == [(0, 7, "turn_on_led")]
+    assert whole_windows(snapshots[:6], [(0, 2, "turn_on_led")]) == []
+    both = [(0, 2, "turn_on_led"), (5, 8, "turn_off_led")]  # the second began too early for the first to last
+    assert whole_windows(snapshots, both) == []
 
 
 def test_windows_end_after_the_task_and_name_no_other():
