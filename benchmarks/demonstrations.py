@@ -85,7 +85,10 @@ def play_chains(job: tuple[range, str | None]) -> list[tuple[str, ...]]:
             before, obs = None, desk.reset(chain.robot_obs, chain.scene_obs)
             for task in chain.tasks:
                 commands.append(task)
-                fulfilled, obs, before = fulfil(desk, obs, task, rng, before=before, variety=0.3)
+                try:
+                    fulfilled, obs, before = fulfil(desk, obs, task, rng, before=before, variety=0.3)
+                except SimulationError:
+                    fulfilled = False
                 if not fulfilled:
                     commands.append("")
                     break

@@ -11,7 +11,7 @@ Three losses, summed:
     states                  a linear head on the picture's embedding predicts what the caption says in numbers (smooth
                             L1); it is dropped afterwards, and makes that linear policies find the state
 
-`record` continues an interrupted recording; sessions with a number divisible by ten are held out.
+`record` continues an interrupted recording; one round of all desks and assets in ten is held out.
 """
 
 import itertools
@@ -59,6 +59,8 @@ MODEL = "lansar-desk"
 GRAMMAR = Path(__file__).with_name("clip_grammar.yaml")
 MOMENTS = 400
 """Moments of a session; a file each."""
+ROUND = 2 * len(SCENE_NAMES)
+"""Sessions in which each desk is shown once with each kind of assets."""
 EVERY = 10
 """Control steps between moments."""
 NEAR = 0.15
@@ -293,7 +295,7 @@ class Data:
 
     def __init__(self, options: Options, held_out: bool):
         files = [f for f in sorted(options.root.glob("session_*.npz")) if "partial" not in f.name]
-        files = [file for file in files if (int(file.stem[-4:]) % 10 == 0) == held_out]
+        files = [file for file in files if (int(file.stem[-4:]) // ROUND % 10 == 0) == held_out]
         if not files:
             raise SystemExit(
                 f"there are no sessions in {options.root}: run `python scripts/train_clip.py record` first"

@@ -107,12 +107,11 @@ def fulfil(
     *,
     before: Observation | None = None,
     variety: float = 1.0,
-    noise: float = 0.2,
 ) -> tuple[bool, Observation, Observation]:
     """Carries out a task as a command of the benchmark: up to the step in which it is fulfilled, or for 360 steps.
 
     Args:
-        desk, obs, rng, before, variety, noise: As for `carry_out`.
+        desk, obs, rng, before, variety: As for `carry_out`.
         task: One of `SKILLS`.
 
     Returns:
@@ -121,9 +120,7 @@ def fulfil(
     start, begun, earlier, left = desk.snapshot(), obs, before, STEPS_PER_COMMAND
     while left:
         began = left
-        frames = carry_out(
-            desk, obs, SKILLS[task], rng, start=begun, before=earlier, variety=variety, noise=noise, steps=left
-        )
+        frames = carry_out(desk, obs, SKILLS[task], rng, start=begun, before=earlier, variety=variety, steps=left)
         for frame, after, snapshot in frames:
             earlier, obs, left = frame, after, left - 1
             if is_fulfilled(task, start, snapshot):
