@@ -15,7 +15,6 @@ Three losses, summed:
 """
 
 import itertools
-import json
 import multiprocessing
 import sys
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from tqdm import tqdm
 
 from lerobot_lansar.calvin import (
     BULB,
+    CAMERAS,
     COLORS,
     DRAWER,
     GRIPPER_WIDTH,
@@ -85,10 +85,11 @@ class Options:
     batch_size: int = 96
     learning_rate: float = 1e-3
     seed: int = 0
+    device: str = "cpu"
     # YAML files of sentences by task (CALVIN's form) that `judge` assigns to tasks.
     sentences: list[Path] = field(default_factory=list)
     # Where `train` writes the weights, and `judge` reads them.
-    output: Path = CLIP_MODELS / f"{MODEL}.safetensors"
+    output: Path = CLIP_MODELS / f"{MODEL}-v1.safetensors"
 
 
 # ---- moments
@@ -113,13 +114,12 @@ def _record_session(job: tuple[int, Options]) -> None:
     rng = np.random.default_rng([11, number])
     scene = SCENE_NAMES[number % len(SCENE_NAMES)]
     assets = options.assets if number // len(SCENE_NAMES) % 2 else None
-    resize = _resizer()
+    clip = Clip(ClipConfig(MODEL, ""))
     rows: dict[str, list[np.ndarray]] = {}
     with Desk(scene, assets, cameras=()) as desk:
         for obs, snapshot in itertools.islice(_play(desk, rng), MOMENTS):
             row = {
-                "static": resize(desk.render("static")),
-                "gripper": resize(desk.render("gripper")),
+                **{camera: _as_seen(clip, desk.render(camera)) for camera in CAMERAS},
                 "robot_obs": obs["robot_obs"],
                 "scene_obs": obs["scene_obs"],
                 "places": np.array([_place(snapshot.blocks[color]) for color in COLORS]),
@@ -132,16 +132,9 @@ def _record_session(job: tuple[int, Options]) -> None:
     partial.rename(file)
 
 
-def _resizer():
-    """Brings a picture to the size at which the CLIP sees it, as `Clip.encode_images` does."""
-    size = json.loads((CLIP_MODELS / f"{MODEL}.json").read_text())["vision_cfg"]["image_size"]
-
-    def resize(picture: np.ndarray) -> np.ndarray:
-        x = torch.from_numpy(picture.copy()).permute(2, 0, 1)[None].float()
-        x = F.interpolate(x, (size, size), mode="bicubic", align_corners=False, antialias=True)
-        return x[0].permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
-
-    return resize
+def _as_seen(clip: Clip, picture: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 -> (S, S, 3) uint8, at the size at which the CLIP sees it."""
+    return (255 * clip.images.resize(picture[None])[0]).round().byte().permute(1, 2, 0).numpy()
 
 
 def _play(desk: Desk, rng: np.random.Generator):
@@ -315,17 +308,19 @@ class Data:
 
 
 def _augment(pictures: Tensor, generator: torch.Generator) -> Tensor:
-    """Other light, other colours, noise: (B, 3, S, S) in [0, 1]."""
+    """Other saturation, contrast, light and tint, and noise: (B, 3, S, S) in [0, 1]."""
     count = len(pictures)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(count, *shape, 1, 1, generator=generator)
+        return low + (high - low) * torch.rand(count, *shape, generator=generator)
 
-    grey = pictures.mean(1, keepdim=True)
-    pictures = grey + (pictures - grey) * uniform(0.6, 1.4, 1)
-    pictures = (pictures - 0.5) * uniform(0.7, 1.3, 1) + 0.5
-    pictures = pictures * uniform(0.85, 1.15, 3) + uniform(-0.1, 0.1, 1)
-    return (pictures + 0.02 * torch.randn(pictures.shape, generator=generator)).clamp(0, 1)
+    saturation, contrast = uniform(0.6, 1.4, 1, 1), uniform(0.7, 1.3, 1, 1)
+    mix = saturation * torch.eye(3) + (1 - saturation) / 3  # of the three colours, (B, 3, 3)
+    tint, light = uniform(0.85, 1.15, 3, 1), uniform(-0.1, 0.1, 1, 1)
+    offset = tint * (0.5 - 0.5 * contrast) + light
+    mixed = torch.baddbmm(offset, tint * contrast * mix, pictures.flatten(2)).view_as(pictures)
+    noise = torch.randn(pictures.shape, generator=generator)
+    return mixed.add_(noise, alpha=0.02).clamp_(0, 1)
 
 
 def train(options: Options) -> None:
@@ -335,13 +330,22 @@ def train(options: Options) -> None:
     torch.manual_seed(options.seed)
     rng, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
     data, commands = Data(options, held_out=False), Commands(rng)
-    clip = Clip(ClipConfig(MODEL, ""))
+    clip = Clip(ClipConfig(MODEL, ""), options.device)
     model = clip.model.train().requires_grad_(True)
-    heads = nn.ModuleDict({camera: nn.Linear(clip.embed_dim, 16) for camera in UNITS})
+    heads = nn.ModuleDict({camera: nn.Linear(clip.embed_dim, 16) for camera in UNITS}).to(options.device)
     weights = [*model.parameters(), *heads.parameters()]
     optimizer = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.05, betas=(0.9, 0.98))
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.learning_rate, options.steps, pct_start=0.05)
     contrast, tasks = ClipLoss(), list(TASKS.values())
+
+    def see(pictures: Tensor) -> Tensor:
+        with torch.autocast(clip.device.type, torch.bfloat16):  # half the time on a CPU that has it
+            x = _augment(pictures, generator).to(clip.device, memory_format=torch.channels_last)
+            return clip.images.embed(x).float()
+
+    def read(texts: list[str]) -> Tensor:
+        return F.normalize(model.encode_text(clip.tokenizer(texts).to(clip.device)), dim=-1)
+
     means: dict[str, float] = {}
     with tqdm(range(options.steps), unit="update") as bar:
         for step in bar:
@@ -350,20 +354,18 @@ def train(options: Options) -> None:
             for camera in UNITS:
                 rows = np.sort(rng.choice(len(data), options.batch_size, replace=False))
                 pictures = torch.from_numpy(data.arrays[camera][rows]).permute(0, 3, 1, 2).float() / 255
-                seen = model.encode_image((_augment(pictures, generator) - clip._mean) / clip._std)
+                seen = see(pictures)
                 moments = [data.moment(row) for row in rows]
-                said = model.encode_text(clip.tokenizer([caption(m, camera, rng) for m in moments]))
-                losses[f"{camera} captions"] = contrast(F.normalize(seen, dim=-1), F.normalize(said, dim=-1), scale)
-                states = [numbers(m, camera) for m in moments]
-                values, shown = (torch.tensor(np.stack(part)).float() for part in zip(*states, strict=True))
-                unit = torch.tensor(UNITS[camera]).float()
-                centre = torch.tensor(CENTRES[camera]).float()
-                error = F.smooth_l1_loss(heads[camera](seen), (values - centre) / unit, reduction="none", beta=0.1)
+                said = read([caption(m, camera, rng) for m in moments])
+                losses[f"{camera} captions"] = contrast(F.normalize(seen, dim=-1), said, scale)
+                values, shown = (np.stack(part) for part in zip(*(numbers(m, camera) for m in moments), strict=True))
+                values, shown = (
+                    torch.from_numpy(part).float().to(clip.device)
+                    for part in ((values - CENTRES[camera]) / UNITS[camera], shown)
+                )
+                error = F.smooth_l1_loss(heads[camera](seen), values, reduction="none", beta=0.1)
                 losses[f"{camera} states"] = 3 * (error * shown).sum() / shown.sum()
-            pairs = [
-                F.normalize(model.encode_text(clip.tokenizer([commands.draw(task) for task in tasks])), dim=-1)
-                for _ in range(2)
-            ]
+            pairs = [read([commands.draw(task) for task in tasks]) for _ in range(2)]
             losses["commands"] = contrast(*pairs, scale)
             optimizer.zero_grad(set_to_none=True)
             torch.stack(list(losses.values())).sum().backward()
@@ -374,7 +376,7 @@ def train(options: Options) -> None:
                 means[name] = 0.98 * means.get(name, loss.item()) + 0.02 * loss.item()
             if step % 20 == 0:
                 bar.set_postfix({name: f"{mean:.3f}" for name, mean in means.items()})
-    state = {name: value.detach().half().contiguous() for name, value in model.state_dict().items()}
+    state = {name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()}
     save_file(state, options.output, {"trained_with": " ".join(["python", *sys.argv])})
     print(f"{options.output}: {options.output.stat().st_size / 1e6:.1f} MB; losses {means}")
 
@@ -390,9 +392,7 @@ CENTRES = {
 
 def judge(options: Options) -> None:
     """Prints how many held-out sentences are nearest to their own task, and what linear probes read from pictures."""
-    from safetensors.torch import load_file
-
-    clip = Clip(ClipConfig(MODEL, ""), weights={k: v.float() for k, v in load_file(options.output).items()})
+    clip = Clip(ClipConfig(MODEL, str(options.output)))
     _judge_sentences(clip, options)
     _judge_pictures(clip, options)
 

@@ -25,7 +25,7 @@ def checkpoint(tmp_path):
         feedforward=64,
         use_images=False,
         window=8,
-        clip=ClipConfig("lansar-tiny", ""),
+        clip=ClipConfig("lansar-desk", ""),
         **SMALL,
     )
     config.input_features, config.output_features = {}, {}

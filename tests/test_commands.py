@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
+from safetensors.torch import load_file
 
+from lerobot_lansar.clip.config import ClipConfig
+from lerobot_lansar.clip.model import Clip
 from lerobot_lansar.envs.pictures import Pictures
 
 BIN = Path(sys.executable).parent
@@ -48,7 +51,7 @@ def dataset(run, work):
         "--repo_id=me/desk",
         "--output_dir=data",
         "--embed=true",
-        "--clip.model=lansar-tiny",
+        "--clip.model=lansar-desk",
         "--clip.pretrained=",
     )
     return ["--dataset.repo_id=me/desk", f"--dataset.root={work / 'data'}"]
@@ -61,7 +64,7 @@ SMALL_LANSAR = [
     "--policy.decoder_layers=1",
     "--policy.decoder_heads=2",
     "--policy.feedforward=64",
-    "--policy.clip.model=lansar-tiny",
+    "--policy.clip.model=lansar-desk",
     "--policy.clip.pretrained=",
     "--policy.device=cpu",
     "--policy.push_to_hub=false",
@@ -98,6 +101,48 @@ def lansar(run, dataset):
         "output_dir=out/lansar",
     )
     return "out/lansar/checkpoints/last/pretrained_model"
+
+
+def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, dataset):
+    options = [*SMALL_LANSAR, *TRAINING, "--policy.finetune_clip=true", "--policy.window=4", "--policy.optimizer=muon"]
+    tuned = "out/tuned/checkpoints/last/pretrained_model"
+    run(
+        "lerobot-train",
+        "--policy.type=lansar",
+        *dataset,
+        *options,
+        "--steps=2",
+        "--save_freq=1",
+        "--output_dir=out/tuned",
+    )
+    decoded = list((work / "data/.cache/huggingface").glob("lansar_frames_pictures/*/static.npy"))
+    run("lerobot-train", f"--config_path={tuned}/train_config.json", "--resume=true", "--steps=3")
+
+    (file,) = decoded
+    pictures, clip = np.load(file, mmap_mode="r"), Clip(ClipConfig("lansar-desk", ""))
+    shown = LeRobotDataset("me/desk", root=work / "data")[7]["observation.images.static"]
+    seen = clip.images.resize(shown[None])[0].permute(1, 2, 0).numpy()
+    assert np.abs(pictures[7] / 255 - seen).max() < 0.003
+
+    before, after = (
+        load_file(work / f"out/tuned/checkpoints/00000{n}/pretrained_model/model.safetensors") for n in (1, 2)
+    )
+    moved = {name: (after[name] - before[name]).abs().max() for name in after if name.startswith("image_encoder")}
+    moved = {name: most for name, most in moved.items() if most > 0}
+    assert {"image_encoder.visual.conv1.weight", "image_encoder.visual.attnpool.c_proj.weight"} <= set(moved)
+    assert not any("running" in name for name in moved), "statistics of the pictures stay CLIP's"
+    assert max(moved.values()) < 2e-5, "the encoder has its own, smaller learning rate"
+
+    run(
+        "lerobot-eval",
+        f"--policy.path={tuned}",
+        *EVALUATION,
+        "--env.task=open_drawer",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--output_dir=eval_tuned",
+    )
+    assert len(successes(work, "eval_tuned")[0]) == 2
 
 
 def successes(work, folder):

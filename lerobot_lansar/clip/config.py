@@ -7,7 +7,8 @@ from dataclasses import dataclass
 class ClipConfig:
     """Which CLIP."""
 
-    # An open_clip model name (ViT-B-32), or one that comes with this package (lansar-tiny).
+    # An open_clip model name (ViT-B-32), or one that comes with this package (lansar-desk).
     model: str = "ViT-B-32"
-    # An open_clip tag (openai), a local weights file, or nothing for random weights from a fixed seed.
+    # A tag of that model (openai; v1 for lansar-desk), a local weights file, or nothing for random weights from a fixed
+    # seed.
     pretrained: str = "openai"

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from .config import ClipConfig
 
 CLIP_MODELS = Path(__file__).parent / "clip_models"
-"""Model configurations in open_clip's format that come with this package; the place for trained weights too."""
+"""Models that come with this package: `MODEL.json`, a configuration in open_clip's format, and `MODEL-TAG.safetensors`,
+trained weights in float16 (scripts/train_clip.py)."""
 
 
 @functools.cache
@@ -48,7 +49,7 @@ def _model_config(model: str) -> dict[str, Any]:
     if config is None:
         raise ValueError(
             f"clip.model={model!r} is not known to open_clip. Examples: ViT-B-32, ViT-L-14, "
-            'lansar-tiny; all names: python -c "import open_clip; print(open_clip.list_models())"'
+            'lansar-desk; all names: python -c "import open_clip; print(open_clip.list_models())"'
         )
     return config
 
@@ -62,9 +63,80 @@ def embedding_size(model: str) -> int:
     return int(_model_config(model)["embed_dim"])
 
 
+def _packaged_weights(config: ClipConfig) -> Path | None:
+    """The weights file of a tag that comes with this package."""
+    file = CLIP_MODELS / f"{config.model}-{config.pretrained}.safetensors"
+    return file if config.pretrained and file.is_file() else None
+
+
 def weights_are_public(config: ClipConfig) -> bool:
-    """True for an open_clip tag: such weights can be downloaded by name, so checkpoints need not contain them."""
-    return bool(config.pretrained and _open_clip().get_pretrained_cfg(config.model, config.pretrained))
+    """True for a tag: such weights can be had by name, so checkpoints need not contain them."""
+    known = _open_clip().get_pretrained_cfg(config.model, config.pretrained) or _packaged_weights(config)
+    return bool(config.pretrained and known)
+
+
+class ImageEncoder(nn.Module):
+    """The image half of a CLIP.
+
+    Its normalisation layers keep their statistics when it is trained: a policy's batch is a few demonstrations.
+
+    Args:
+        visual: open_clip's image encoder.
+        preprocess: What open_clip says of its pictures: size, mean, std.
+
+    Attributes:
+        size: Height and width of the pictures that it sees.
+    """
+
+    visual: Any
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, visual: nn.Module, preprocess: dict[str, Any]) -> None:
+        super().__init__()
+        self.visual = visual
+        size = preprocess["size"]
+        self.size: tuple[int, int] = (size, size) if isinstance(size, int) else tuple(size)
+        for name in ("mean", "std"):
+            self.register_buffer(name, torch.tensor(preprocess[name]).view(3, 1, 1), persistent=False)
+
+    def train(self, mode: bool = True) -> "ImageEncoder":
+        super().train(mode)
+        for module in self.modules():
+            if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                module.eval()
+        return self
+
+    def resize(self, images: Tensor | np.ndarray) -> Tensor:
+        """Brings pictures to the size that the encoder sees.
+
+        Args:
+            images: uint8 (B, H, W, 3), or float (B, 3, H, W) in [0, 1].
+
+        Returns:
+            (B, 3, S, S) float32 in [0, 1], on the encoder's device.
+
+        Raises:
+            ValueError: Another shape or dtype.
+        """
+        x = torch.as_tensor(images)
+        if x.dtype == torch.uint8 and x.ndim == 4 and x.shape[-1] == 3:
+            x = x.to(self.mean.device).permute(0, 3, 1, 2).float() / 255
+        elif not (x.is_floating_point() and x.ndim == 4 and x.shape[1] == 3):
+            raise ValueError(
+                f"images must be uint8 (B, H, W, 3) or float (B, 3, H, W) in [0, 1], got {x.dtype} {tuple(x.shape)}."
+            )
+        x = x.to(self.mean.device, torch.float32)
+        # CALVIN's pictures are square, so a plain resize is open_clip's resize and centre crop.
+        return F.interpolate(x, self.size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
+
+    def embed(self, pictures: Tensor) -> Tensor:
+        """(B, 3, S, S) in [0, 1] -> (B, D)."""
+        return self.visual((pictures - self.mean) / self.std)
+
+    def forward(self, images: Tensor | np.ndarray) -> Tensor:
+        """Pictures as `resize` takes them -> (B, D)."""
+        return self.embed(self.resize(images))
 
 
 class Clip:
@@ -77,6 +149,7 @@ class Clip:
 
     Attributes:
         embed_dim: D.
+        images: The image encoder, which shares its weights with `model`.
 
     Raises:
         ValueError: An unknown model name, or a `pretrained` that is neither a tag nor an existing file.
@@ -89,8 +162,10 @@ class Clip:
         self.config = config
         self.embed_dim = embedding_size(config.model)
         tag = open_clip.get_pretrained_cfg(config.model, config.pretrained) if config.pretrained else {}
-        if weights is None and config.pretrained and not tag and not Path(config.pretrained).is_file():
-            tags = ", ".join(open_clip.list_pretrained_tags_by_model(config.model)) or "it has none"
+        pretrained = str(_packaged_weights(config) or config.pretrained)
+        if weights is None and pretrained and not tag and not Path(pretrained).is_file():
+            ours = [file.stem.removeprefix(f"{config.model}-") for file in CLIP_MODELS.glob(f"{config.model}-*")]
+            tags = ", ".join([*open_clip.list_pretrained_tags_by_model(config.model), *ours]) or "it has none"
             raise ValueError(
                 f"clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of {config.model} ({tags})."
             )
@@ -99,21 +174,18 @@ class Clip:
             torch.manual_seed(0)  # the same random weights every time, without touching the caller's generator
             model = open_clip.create_model(
                 config.model,
-                pretrained=config.pretrained if weights is None and config.pretrained else None,
+                pretrained=pretrained if weights is None and pretrained else None,
                 # Some tags (ViT-B-32/openai) were trained with another activation than their model's file says;
                 # open_clip only warns, and the embeddings would be wrong.
                 force_quick_gelu=bool(tag.get("quick_gelu", False)),
             )
         if weights is not None:
             model.load_state_dict(weights)
-        self.model: Any = model.eval().requires_grad_(False).to(device)
+        # Small convolutions are half as fast again on a CPU with the channels last.
+        self.model: Any = model.eval().requires_grad_(False).to(device, memory_format=torch.channels_last)
         self.device = torch.device(device)
         self.tokenizer = open_clip.get_tokenizer(config.model)
-        preprocess = open_clip.get_model_preprocess_cfg(model)
-        size = preprocess["size"]
-        self.image_size: tuple[int, int] = (size, size) if isinstance(size, int) else tuple(size)
-        self._mean = torch.tensor(preprocess["mean"], device=device).view(3, 1, 1)
-        self._std = torch.tensor(preprocess["std"], device=device).view(3, 1, 1)
+        self.images = ImageEncoder(model.visual, open_clip.get_model_preprocess_cfg(model)).to(device)
 
     @functools.cached_property
     def weights_sha256(self) -> str:
@@ -128,33 +200,13 @@ class Clip:
         """Moves everything to another device."""
         self.device = torch.device(device)
         self.model.to(device)
-        self._mean, self._std = self._mean.to(device), self._std.to(device)
+        self.images.to(device)
 
     @torch.no_grad()
     def encode_images(self, images: Tensor | np.ndarray) -> Tensor:
-        """Embeds pictures.
-
-        Args:
-            images: uint8 (B, H, W, 3), or float (B, 3, H, W) in [0, 1].
-
-        Returns:
-            (B, D) float32 on this CLIP's device.
-
-        Raises:
-            ValueError: Another shape or dtype.
-        """
-        x = torch.as_tensor(images)
-        if x.dtype == torch.uint8 and x.ndim == 4 and x.shape[-1] == 3:
-            x = x.to(self.device).permute(0, 3, 1, 2).float() / 255
-        elif not (x.is_floating_point() and x.ndim == 4 and x.shape[1] == 3):
-            raise ValueError(
-                f"images must be uint8 (B, H, W, 3) or float (B, 3, H, W) in [0, 1], got {x.dtype} {tuple(x.shape)}."
-            )
-        x = x.to(self.device, torch.float32)
-        # CALVIN's pictures are square, so a plain resize is open_clip's resize and centre crop.
-        x = F.interpolate(x, self.image_size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
+        """Embeds pictures, (B, D) float32 on this CLIP's device; see `ImageEncoder.resize` for what it takes."""
         with self._full_precision():
-            return self.model.encode_image((x - self._mean) / self._std)
+            return self.images(images)
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Tensor:

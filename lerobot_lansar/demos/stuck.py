@@ -8,23 +8,23 @@ from ..desk.desk import Observation
 from ..desk.oracle import Snapshot
 
 USUAL_FRAMES = {
-    ("rotate_block", None): 123,
-    ("push_block", None): 96,
-    ("move_slider", None): 96,
+    ("rotate_block", None): 126,
+    ("push_block", None): 98,
+    ("move_slider", None): 98,
     ("open_drawer", None): 105,
     ("close_drawer", None): 121,
-    ("lift_block", "table"): 74,
-    ("lift_block", "slider"): 86,
-    ("lift_block", "drawer"): 68,
-    ("place_block", "slider"): 75,
-    ("place_block", "drawer"): 81,
+    ("lift_block", "table"): 75,
+    ("lift_block", "slider"): 92,
+    ("lift_block", "drawer"): 69,
+    ("place_block", "slider"): 78,
+    ("place_block", "drawer"): 82,
     ("stack_block", None): 74,
-    ("unstack_block", None): 45,
+    ("unstack_block", None): 48,
     ("turn_on_lightbulb", None): 87,
-    ("turn_off_lightbulb", None): 85,
-    ("turn_on_led", None): 63,
-    ("turn_off_led", None): 66,
-    ("push_into_drawer", None): 117,
+    ("turn_off_lightbulb", None): 86,
+    ("turn_on_led", None): 64,
+    ("turn_off_led", None): 67,
+    ("push_into_drawer", None): 119,
 }
 """Kind and place of a task to the demonstrator's mean number of frames (eight hours of chains, variety 0.3, desk D)."""
 

@@ -126,6 +126,11 @@ class LanSARConfig(PreTrainedConfig):
 
     # Which CLIP embeds commands and pictures.
     clip: ClipConfig = field(default_factory=ClipConfig)
+    # CLIP's image encoder is trained with the policy (section 6.5.1), which needs a GPU for more than a trial; a window
+    # then costs two pictures a step. Pictures are read from the dataset, decoded once into its folder.
+    finetune_clip: bool = False
+    # Peak learning rate of the image encoder.
+    clip_learning_rate: float = 1e-5
 
     # Upload the trained policy; needs --policy.repo_id=you/name.
     push_to_hub: bool = False
@@ -168,6 +173,8 @@ class LanSARConfig(PreTrainedConfig):
                 "keep one of them."
             )
 
+        if self.finetune_clip and not self.use_images:
+            raise ValueError("--policy.finetune_clip=true needs --policy.use_images=true.")
         if self.since_command and not self.use_spatial_context:
             raise ValueError("--policy.since_command=true needs --policy.use_spatial_context=true, which it extends.")
 

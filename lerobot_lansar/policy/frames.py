@@ -2,21 +2,28 @@
 
 Reading a window of 64 steps takes about 150 ms with LeRobot's delta timestamps, below 1 ms with these arrays. They are
 made from the dataset's parquet files at first use, kept in the dataset's folder (`CACHE`), and made again when the
-dataset has changed (`dataset_fingerprint`). CLIP embeddings of the pictures are separate: `lerobot_lansar.clip.store`.
+dataset has changed (`dataset_fingerprint`). So are the pictures, for a policy that learns to see. CLIP embeddings of
+the pictures are separate: `lerobot_lansar.clip.store`.
 """
 
+import json
 import logging
 import shutil
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
+import torch
+from filelock import FileLock
 from lerobot.datasets.io_utils import load_tasks
+from torch import Tensor
 from tqdm import tqdm
 
-from ..clip.store import data_files, dataset_fingerprint
+from ..clip.store import IMAGE_FEATURES, data_files, dataset_fingerprint
 from ..datasets import INTERVENTION_FEATURE
+from ..jobs.staging import write_atomically
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM
 
 CACHE = ".cache/huggingface/lansar_frames"
@@ -124,6 +131,68 @@ def load_frames(root: Path) -> dict[str, np.ndarray]:
                 return frames
     names = ["index", *COLUMNS, "first", "end", *(name for name in OPTIONAL if (cache / f"{name}.npy").exists())]
     return {name: np.load(cache / f"{name}.npy", mmap_mode="r") for name in names}
+
+
+def load_pictures(root: Path, size: int, resize: Callable[[Tensor], Tensor]) -> dict[str, np.ndarray]:
+    """The dataset's pictures in the order of LeRobot's absolute `index`, decoded once into files beside `CACHE`.
+
+    An interrupted pass goes on where it was; of several processes one decodes and the others wait.
+
+    Args:
+        root: The dataset's folder.
+        size: Larger pictures are brought to this height and width.
+        resize: Does that: (B, 3, H, W) -> (B, 3, size, size), both in [0, 1].
+
+    Returns:
+        {"static": (total_frames, H, W, 3) uint8, "gripper": ...}, memory-mapped.
+
+    Raises:
+        ValueError: The dataset lacks one of the two cameras.
+    """
+    folder = root / f"{CACHE}_pictures" / f"{dataset_fingerprint(root)[:16]}-{size}"
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_suffix(".lock")):
+            if not folder.is_dir():
+                _decode_pictures(root, size, resize, folder.with_suffix(".partial"))
+                folder.with_suffix(".partial").rename(folder)
+    return {camera: np.load(folder / f"{camera}.npy", mmap_mode="r") for camera in IMAGE_FEATURES}
+
+
+def _decode_pictures(root: Path, size: int, resize: Callable[[Tensor], Tensor], folder: Path) -> None:
+    """Writes the files of `load_pictures`; `progress.json` says how many frames they hold."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # takes seconds
+
+    dataset = LeRobotDataset("local/pictures", root=root)
+    missing = set(IMAGE_FEATURES.values()) - set(dataset.meta.camera_keys)
+    if missing:
+        raise ValueError(
+            f"--policy.finetune_clip=true needs the dataset's pictures, but {root} has no "
+            f"{', '.join(sorted(missing))}: convert it with --images=video or png."
+        )
+    folder.mkdir(exist_ok=True)
+    progress = folder / "progress.json"
+    done = json.loads(progress.read_text()) if progress.exists() else 0
+    arrays: dict[str, np.ndarray] = {}
+    for camera, feature in IMAGE_FEATURES.items():
+        file, side = folder / f"{camera}.npy", min(size, *sorted(dataset.meta.features[feature]["shape"])[1:])
+        arrays[camera] = (
+            np.load(file, mmap_mode="r+")
+            if done
+            else np.lib.format.open_memmap(file, "w+", np.uint8, (len(dataset), side, side, 3))
+        )
+    for row in tqdm(range(done, len(dataset)), initial=done, total=len(dataset), desc="decoding", unit="frame"):
+        found = dataset[row]
+        for camera, feature in IMAGE_FEATURES.items():
+            picture = found[feature][None]
+            picture = resize(picture) if picture.shape[-1] > size else picture
+            arrays[camera][row] = (255 * picture[0]).round().to(torch.uint8).permute(1, 2, 0).numpy()
+        if row % 1000 == 999:
+            for array in arrays.values():
+                array.flush()  # type: ignore[attr-defined]
+            write_atomically(progress, json.dumps(row + 1))
+    for array in arrays.values():
+        array.flush()  # type: ignore[attr-defined]
 
 
 def load_sentence_tasks(root: Path) -> dict[str, set[int]]:

@@ -16,6 +16,9 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from ..calvin import ANGLE_UNIT, CONTROL_MODES, GRIPPER_ACTION, POSITION_UNIT, TCP_POSE
+from ..clip.config import ClipConfig
+from ..clip.model import Clip, ImageEncoder
+from ..clip.store import IMAGE_FEATURES
 from .card import card_text
 from .configuration_lansar import LanSARConfig
 from .losses import Losses
@@ -68,6 +71,7 @@ TRAINED_OPTIONS = (
     "since_command",
     "target",
     "clip",
+    "finetune_clip",
 )
 """Options that must stay as a checkpoint was trained, because its weights or its scaling depend on them."""
 
@@ -100,10 +104,19 @@ class LanSARPolicy(PreTrainedPolicy):
         self._losses: Losses | None = None  # in training only
         self.scaler = Scaler(config.orientation, config.egocentric_blocks, config.since_command)
         self.network = LanSARNetwork(config.network)
+        self.image_encoder: ImageEncoder | None = None
+        if config.finetune_clip:
+            # Only a training starts from CLIP's weights; whoever loads a checkpoint gets its own.
+            pretrained = config.clip.pretrained if dataset_meta is not None else ""
+            self.image_encoder = Clip(ClipConfig(config.clip.model, pretrained)).images.requires_grad_(True)
+            # safetensors saves no other format
+            self.image_encoder.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+            self.image_encoder.visual.set_grad_checkpointing()  # or the activations fill any GPU
         if dataset_meta is not None:
             self._check_pretrained()
-            _drop_videos(dataset_meta.features)
-            windows = Windows(dataset_meta.root, dataset_meta.features, dataset_meta.total_frames, config)
+            root, features = dataset_meta.root, dataset_meta.features
+            windows = Windows(root, features, dataset_meta.total_frames, config, self.image_encoder)
+            _drop_videos(features)
             environment_state = windows.frames["environment_state"]
             self.scaler.fit(
                 torch.tensor(windows.frames["state"]),
@@ -142,12 +155,16 @@ class LanSARPolicy(PreTrainedPolicy):
                 )
 
     def get_optim_params(self) -> Any:
+        parameters = list(self.network.parameters())
+        groups: list[dict[str, Any]] = [{"params": parameters}]
         if self.config.optimizer == "muon":
-            return parameter_groups(self)
-        parameters = list(self.parameters())
-        if parameters[0].is_cuda:  # one kernel that reads and writes everything once
-            return [{"params": parameters, "fused": True}]
-        return parameters
+            groups = parameter_groups(self.network)
+        if self.image_encoder is not None:
+            encoder = list(self.image_encoder.parameters())
+            groups.append({"params": encoder, "lr": self.config.clip_learning_rate, "name": "image encoder"})
+        if self.config.optimizer == "adamw" and parameters[0].is_cuda:
+            groups = [group | {"fused": True} for group in groups]  # one kernel that reads and writes everything once
+        return groups if len(groups) > 1 or parameters[0].is_cuda else parameters
 
     def reset(self) -> None:
         """Clears all histories; LeRobot calls this before each batch of episodes."""
@@ -210,7 +227,7 @@ class LanSARPolicy(PreTrainedPolicy):
         if self.training and self.config.state_noise:
             state = self._add_noise(state)
         inputs = self.scaler.encode(state, batch[OBS_ENV_STATE], batch.get(START))
-        pictures = (batch.get(key) for key in CLIP_IMAGE.values())
+        pictures = self._embed_windows(batch) if self.image_encoder else [batch.get(k) for k in CLIP_IMAGE.values()]
         motion, logit, contrast = self.network(
             batch[CLIP_COMMAND], *inputs, valid_steps, *pictures, batch.get(COMMAND_TASKS)
         )
@@ -223,6 +240,13 @@ class LanSARPolicy(PreTrainedPolicy):
             "gripper_loss": F.binary_cross_entropy_with_logits(logit.float(), target[:, 6], reduction="none"),
         }
         return terms, contrast
+
+    def _embed_windows(self, batch: dict[str, Any]) -> list[Tensor]:
+        """The embeddings of both cameras' pictures at all steps, (B, n, D) each, 0 where there is padding."""
+        assert self.image_encoder is not None
+        valid_steps, shape = batch[VALID_STEPS], batch[OBS_STATE].shape[:2]
+        found = [self.image_encoder(batch[key]) for key in IMAGE_FEATURES.values()]  # (N, D)
+        return [e.new_zeros(shape.numel(), e.shape[1]).index_copy(0, valid_steps, e).unflatten(0, shape) for e in found]
 
     def _add_noise(self, state: Tensor) -> Tensor:
         """(B, n, 15) -> the same with normal noise of `state_noise`. Angles are not wrapped: that could make a jump."""
@@ -239,7 +263,8 @@ class LanSARPolicy(PreTrainedPolicy):
 
         Args:
             batch: A preprocessed observation: observation.state (B, 15), observation.environment_state (B, 24),
-                observation.clip.* (B, D), task (B sentences) and, if the environment provides it,
+                observation.clip.* (B, D), with `finetune_clip` observation.images.* (B, 3, H, W) in [0, 1] instead of
+                those of pictures, task (B sentences) and, if the environment provides it,
                 observation.control_mode (B, 1): 0 for "rel", 1 for "abs". Without it, the option `control_mode` holds.
 
         Returns:
@@ -255,9 +280,12 @@ class LanSARPolicy(PreTrainedPolicy):
         state, environment_state = batch[OBS_STATE].float(), batch[OBS_ENV_STATE].float()
         self._check(batch, state, environment_state)
         inputs = [state, environment_state, batch[CLIP_COMMAND]]
-        inputs += [batch[key] for key in CLIP_IMAGE.values()] if self.config.use_images else []
         self._clear_old_histories(batch["task"])
         with torch.autocast(state.device.type, enabled=False):  # mixed precision does not speed up a single step
+            if self.image_encoder is not None:
+                inputs += [self.image_encoder(batch[key]) for key in IMAGE_FEATURES.values()]
+            elif self.config.use_images:
+                inputs += [batch[key] for key in CLIP_IMAGE.values()]
             motion, logit = self._predict(*inputs)
             return self._to_action(state, motion, logit, batch.get("observation.control_mode"))
 

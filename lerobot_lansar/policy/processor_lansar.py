@@ -12,12 +12,14 @@ The batch then holds, in training and (without the axis n) in evaluation:
     observation.state              (B, n, 15)
     observation.environment_state  (B, n, 24)
     observation.clip.command       (B, D)
-    observation.clip.static        (B, n, D) with `use_images`
-    observation.clip.gripper       (B, n, D) with `use_images`
+    observation.clip.static        (B, n, D) with `use_images`, unless `finetune_clip`
+    observation.clip.gripper       (B, n, D) likewise
     task                           B sentences
 
 and in training only:
 
+    observation.images.static      (N, H, W, 3) uint8, the pictures of the valid steps; with `finetune_clip`
+    observation.images.gripper     (N, H, W, 3) uint8, likewise
     start_environment_state        (B, 1, 24) when the command began; with `since_command`
     action                         (B, n, 7), the targets
     valid_steps                    (N,) which of the B * n steps are not padding
@@ -82,11 +84,12 @@ class WindowStep(ProcessorStep):
         observation = {
             key: value
             for key, value in (transition.get(TransitionKey.OBSERVATION) or {}).items()
-            if not key.startswith("observation.images.")  # embeddings replace pictures
+            if not key.startswith("observation.images.")  # of the sampled frames
         }
         observation[OBS_STATE] = window["state"]
         observation[OBS_ENV_STATE] = window["environment_state"]
-        observation.update({key: window[name] for name, key in CLIP_IMAGE.items() if name in window})
+        keys = IMAGE_FEATURES if self.windows.pictures else CLIP_IMAGE
+        observation.update({key: window[name] for name, key in keys.items() if name in window})
         new = transition.copy()
         new[TransitionKey.OBSERVATION] = observation
         new[TransitionKey.ACTION] = window["target"]
@@ -116,7 +119,7 @@ class ClipStep(ProcessorStep):
 
     Attributes:
         model, pretrained: See `ClipConfig`.
-        use_images: Whether the policy reads pictures.
+        use_images: Whether the policy reads pictures' embeddings.
         weights_sha256: Hash of the CLIP that the policy was trained with; "" before training.
     """
 
@@ -192,7 +195,7 @@ class ClipStep(ProcessorStep):
         if weights_are_public(ClipConfig(self.model, self.pretrained)):
             return {}
         weights = self.clip().model.state_dict()
-        return {name: value.detach().cpu().clone() for name, value in weights.items()}
+        return {name: value.detach().cpu().contiguous().clone() for name, value in weights.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self._weights, self._clip = dict(state), None
@@ -214,7 +217,7 @@ def make_lansar_pre_post_processors(
         Preprocessor and postprocessor.
     """
     steps = make_default_policy_processor_steps(config, dataset_stats)
-    clip = ClipStep(config.clip.model, config.clip.pretrained, config.use_images)
+    clip = ClipStep(config.clip.model, config.clip.pretrained, config.use_images and not config.finetune_clip)
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,

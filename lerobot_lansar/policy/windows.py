@@ -25,9 +25,10 @@ import torch
 from torch import Tensor
 
 from ..calvin import ACTION_NAMES, POSE_UNITS, TCP_POSE, wrap_angle
+from ..clip.model import ImageEncoder
 from ..clip.store import load_embeddings
 from .configuration_lansar import LanSARConfig
-from .frames import find_paraphrases, load_frames, load_sentence_tasks
+from .frames import find_paraphrases, load_frames, load_pictures, load_sentence_tasks
 
 
 def action_form(features: dict) -> str:
@@ -79,14 +80,16 @@ class Windows:
         features: Its features (`dataset.meta.features`).
         total_frames: Frames in the whole dataset.
         config: The policy's options.
+        images: The image encoder that is trained too; None: the pictures' stored embeddings are read.
 
     Attributes:
         frames: The arrays of `load_frames`.
         targets: (T, 7) from `make_targets`.
         has_target: (T,) bool, False for an episode's last frame with achieved targets.
         counts: (T,) float32, 1 where the demonstrator acted and 0 elsewhere; None where it always did.
-        embeddings: {"static", "gripper"}: (total_frames, D), empty without `use_images`.
-        clip_info: The contents of clip.json, empty without `use_images`.
+        embeddings: {"static", "gripper"}: (total_frames, D), empty without `use_images` and with `finetune_clip`.
+        pictures: {"static", "gripper"}: (total_frames, H, W, 3) uint8, empty without `finetune_clip`.
+        clip_info: The contents of clip.json, empty without `embeddings`.
         sentence_tasks: The CALVIN tasks that each sentence can mean; empty unless `paraphrases` or the contrastive
             loss need them.
 
@@ -94,7 +97,14 @@ class Windows:
         ValueError, FileNotFoundError: The dataset cannot be used; the message says why and what to do.
     """
 
-    def __init__(self, root: Path, features: dict, total_frames: int, config: LanSARConfig) -> None:
+    def __init__(
+        self,
+        root: Path,
+        features: dict,
+        total_frames: int,
+        config: LanSARConfig,
+        images: ImageEncoder | None = None,
+    ) -> None:
         self.length, self.rule = config.window, config.window_start
         self.pad_fully = config.compile_model
         form = action_form(features)
@@ -118,7 +128,10 @@ class Windows:
             self.arrays["counts"] = self.counts
         self.embeddings: dict[str, np.ndarray | Tensor] = {}
         self.clip_info: dict = {}
-        if config.use_images:
+        self.pictures: dict[str, np.ndarray | Tensor] = {}
+        if images is not None:
+            self.pictures.update(load_pictures(root, images.size[0], images.resize))
+        elif config.use_images:
             self._load_embeddings(root, total_frames, config)
         self.paraphrases = config.paraphrases
         needed = config.paraphrases or config.contrastive_weight
@@ -198,10 +211,11 @@ class Windows:
 
         Returns:
             State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) and, with `use_images`, static and gripper
-            (B, n, D), all float32; with `since_command` start (B, 1, 24), the environment state when the command
-            began; counts (B, n) float32, 1 where the demonstrator acted, unless it always did; valid_steps (N,) int64,
-            which of the B * n steps are not padding. Padding repeats the window's last step. On the GPU if the frames
-            fit there.
+            (B, n, D), all float32; with `finetune_clip` static and gripper are instead the pictures of the steps that
+            are not padding, (N, H, W, 3) uint8; with `since_command` start (B, 1, 24), the environment state when the
+            command began; counts (B, n) float32, 1 where the demonstrator acted, unless it always did; valid_steps
+            (N,) int64, which of the B * n steps are not padding. Padding repeats the window's last step. On the GPU if
+            the frames fit there.
         """
         start, end = self.bounds(index)
         longest = self.length if self.pad_fully else (end - start).max()
@@ -209,13 +223,17 @@ class Windows:
         valid_steps = np.flatnonzero(rows < end[:, None])
         rows = np.minimum(rows, end[:, None] - 1)
         frame_rows, embedding_rows = rows, self.frames["index"][rows] if self.embeddings else rows
+        picture_rows = self.frames["index"][rows.flat[valid_steps]] if self.pictures else valid_steps
         if self.on_gpu:
-            frame_rows, embedding_rows = (torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows))
+            frame_rows, embedding_rows, picture_rows = (
+                torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows, picture_rows)
+            )
         found = {name: array[frame_rows] for name, array in self.arrays.items()}
         found |= {name: array[embedding_rows] for name, array in self.embeddings.items()}
         if self.since_command:
             found["start"] = self.arrays["environment_state"][self.frames["first"][start][:, None]]
         window = {name: torch.as_tensor(values).float() for name, values in found.items()}
+        window |= {name: torch.as_tensor(array[picture_rows]) for name, array in self.pictures.items()}
         return window | {"valid_steps": torch.from_numpy(valid_steps)}
 
     def paraphrase(self, commands: list[str]) -> list[str]:
@@ -237,10 +255,11 @@ class Windows:
 
     def _move_to_gpu(self) -> None:
         """Moves the arrays to the GPU if they take at most half of its free memory: lookups then need no transfer."""
-        size = sum(array.nbytes for array in (*self.arrays.values(), *self.embeddings.values()))
+        groups = self.arrays, self.embeddings, self.pictures
+        size = sum(array.nbytes for arrays in groups for array in arrays.values())
         self.on_gpu = self.device.type == "cuda" and size <= torch.cuda.mem_get_info(self.device)[0] / 2
         if self.on_gpu:
-            for arrays in (self.arrays, self.embeddings):
+            for arrays in groups:
                 for name, array in arrays.items():
                     arrays[name] = torch.tensor(array, device=self.device)
 

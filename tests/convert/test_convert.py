@@ -399,9 +399,9 @@ def test_embeddings_are_those_of_the_source_pictures_in_the_order_of_index(tmp_p
     import torch
 
     calvin = write_calvin(tmp_path / "calvin", rgb=True, overlap=3, length=5)
-    clip_options = ClipConfig(model="lansar-tiny", pretrained="")
+    clip_options = ClipConfig(model="lansar-desk", pretrained="")
     out = convert.convert(options(calvin, tmp_path / "out", embed=True, clip=clip_options))
-    clip = clip_module.Clip(clip_module.ClipConfig(model="lansar-tiny", pretrained=""))
+    clip = clip_module.Clip(clip_module.ClipConfig(model="lansar-desk", pretrained=""))
     frames = [frame for start, end, *_ in calvin.windows for frame in range(start, end)]
     for camera, name in (("rgb_static", "static"), ("rgb_gripper", "gripper")):
         stored = np.load(out / "clip" / f"observation.images.{name}.npy", mmap_mode="r")

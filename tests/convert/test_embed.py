@@ -20,8 +20,8 @@ from lerobot_lansar.clip.store import sha256
 
 clip_module = pytest.importorskip("lerobot_lansar.clip.model")
 
-TINY = ClipConfig(model="lansar-tiny", pretrained="")
-ARGUMENTS = ["--repo_id=me/desk", "--clip.model=lansar-tiny", "--clip.pretrained="]
+TINY = ClipConfig(model="lansar-desk", pretrained="")
+ARGUMENTS = ["--repo_id=me/desk", "--clip.model=lansar-desk", "--clip.pretrained="]
 FILES = [f"clip/observation.images.{camera}.npy" for camera in ("static", "gripper")]
 
 
@@ -66,7 +66,7 @@ def test_exact_pictures_give_the_embeddings_of_the_source(made, run, tmp_path):
     assert told.pop("pictures") == "dataset"
     assert other.pop("pictures") == "source"
     assert told == other
-    assert "lansar-tiny" in (dataset / "README.md").read_text(), "the card tells of them"
+    assert "lansar-desk" in (dataset / "README.md").read_text(), "the card tells of them"
 
 
 def test_videos_are_decoded_by_other_processes(made, run, tmp_path):
@@ -185,7 +185,7 @@ def test_verify_looks_at_embeddings_too(made, tmp_path):
     dataset = shutil.copytree(made / "png", tmp_path / "png")
     config = VerifyConfig("me/desk", made / "calvin", dataset)
     (dataset / "clip/state.json").touch()  # of a pass that was killed after its last step but one
-    assert "clip: as lansar-tiny untrained left it, for these frames" in verify(config)
+    assert "clip: as lansar-desk untrained left it, for these frames" in verify(config)
     other = json.loads((dataset / "clip/clip.json").read_text()) | {"fingerprint": "0"}
     (dataset / "clip/clip.json").write_text(json.dumps(other))
     with pytest.raises(Mismatch, match="embeddings of other frames"):
@@ -220,8 +220,8 @@ def test_a_download_from_the_hub_is_embedded_without_touching_the_cache(made, ru
     monkeypatch.setattr(sys, "argv", ["lansar-embed", *ARGUMENTS])
     assert embed.main() == 0
     assert (copy / "README.md").read_text() == before
-    assert "lansar-tiny" in (snapshot / "README.md").read_text()
-    assert "clip: as lansar-tiny" in verify(VerifyConfig("me/desk", made / "calvin"))
+    assert "lansar-desk" in (snapshot / "README.md").read_text()
+    assert "clip: as lansar-desk" in verify(VerifyConfig("me/desk", made / "calvin"))
 
 
 def test_a_dataset_of_an_earlier_version_is_refused(made, run, tmp_path):

@@ -75,7 +75,7 @@ def run(launch):
 @pytest.mark.timeout(1800)  # eight commands, each of which imports LeRobot
 def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
     calvin = write_calvin(tmp_path / "calvin", rgb=True, length=11)  # no two files are equal
-    clip = ClipConfig(model="lansar-tiny", pretrained="")
+    clip = ClipConfig(model="lansar-desk", pretrained="")
     out = convert.convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", embed=True, clip=clip))
     arguments = [
         "lansar-convert",
@@ -83,7 +83,7 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
         "--repo_id=me/desk",
         f"--output_dir={out}",
         "--embed=true",
-        "--clip.model=lansar-tiny",
+        "--clip.model=lansar-desk",
         "--clip.pretrained=",
         "--push_to_hub=true",
         "--private=true",
@@ -121,7 +121,7 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
     for name in local.keys() - {"README.md"}:
         assert stored[name] == local[name], name
     card = stored["README.md"].decode()
-    for part in ("license: mit", "- calvin", "Privileged state", "lansar-tiny", "lerobot-train", "SHA-256"):
+    for part in ("license: mit", "- calvin", "Privileged state", "lansar-desk", "lerobot-train", "SHA-256"):
         assert part in card
     assert str(tmp_path) not in card
 
@@ -135,7 +135,7 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
         "--save_freq=2",
         f"--output_dir={tmp_path / 'train'}",
         "--policy.use_images=true",
-        "--policy.clip.model=lansar-tiny",
+        "--policy.clip.model=lansar-desk",
         "--policy.clip.pretrained=",
         "--policy.device=cpu",
         home="elsewhere",
@@ -146,7 +146,7 @@ def test_a_dataset_goes_to_the_hub_and_comes_back(hub, launch, run, tmp_path):
     code, printed = run("lansar-verify", f"--root={calvin.root}", "--repo_id=me/desk", home="elsewhere")
     assert code == 0, printed
     assert f"{tmp_path / 'elsewhere/lerobot/hub'}" in printed, "what was downloaded, not what was pushed"
-    assert "clip: as lansar-tiny" in printed
+    assert "clip: as lansar-desk" in printed
     code, printed = run(*arguments, home="home")
     assert code == 0, "a second push of the same dataset is no error"
 

@@ -116,9 +116,9 @@ def test_embeddings_are_those_of_pictures_of_the_datasets_size(painted, tmp_path
 
     from lerobot_lansar.clip.config import ClipConfig
 
-    asked = {"embed": True, "clip": ClipConfig("lansar-tiny", ""), "image_size": 32}
+    asked = {"embed": True, "clip": ClipConfig("lansar-desk", ""), "image_size": 32}
     out = convert(options(painted, tmp_path / "out", **asked))
-    clip = clip_module.Clip(clip_module.ClipConfig("lansar-tiny", ""))
+    clip = clip_module.Clip(clip_module.ClipConfig("lansar-desk", ""))
     seen = torch.from_numpy(resize(painted.frames[101]["rgb_static"], 32))[None]
     stored = np.load(out / "clip/observation.images.static.npy")[1]
     np.testing.assert_allclose(stored, clip.encode_images(seen)[0].numpy(), atol=2e-3)

@@ -281,7 +281,7 @@ def test_pictures_are_checked_where_only_embeddings_need_them(tmp_path):
 
     calvin = write_calvin(tmp_path / "calvin", rgb=True, tasks=("open_drawer",) * 2, length=4)
     calvin.rewrite(102, rgb_static=np.zeros((200, 199, 3), np.uint8))
-    asked = {"embed": True, "clip": ClipConfig("lansar-tiny", "")}
+    asked = {"embed": True, "clip": ClipConfig("lansar-desk", "")}
     with pytest.raises(ValueError, match=r"episode_0000102\.npz: array 'rgb_static' is uint8"):
         convert(options(calvin, tmp_path / "out", **asked))
     out = convert(options(calvin, tmp_path / "out", skip_bad=True, **asked))

@@ -54,7 +54,7 @@ def lansar(tmp_path_factory):
         feedforward=96,
         use_images=False,
         control_mode="abs",
-        clip=ClipConfig("lansar-tiny", ""),
+        clip=ClipConfig("lansar-desk", ""),
         input_features={key: features[key] for key in list(SIZES)[:2]},
         output_features={"action": features["action"]},
     )

@@ -92,10 +92,10 @@ def test_the_copies_share_their_weights():
 def lansar():
     torch.manual_seed(0)
     options = {"hidden": 96, "context_heads": 4, "decoder_layers": 2, "decoder_heads": 4, "use_images": False}
-    return LanSARPolicy(LanSARConfig(device="cpu", clip=ClipConfig("lansar-tiny", ""), **options)).eval()
+    return LanSARPolicy(LanSARConfig(device="cpu", clip=ClipConfig("lansar-desk", ""), **options)).eval()
 
 
-SAID = {"observation.clip.command": torch.linspace(-1, 1, embedding_size("lansar-tiny"))}
+SAID = {"observation.clip.command": torch.linspace(-1, 1, embedding_size("lansar-desk"))}
 
 
 def test_lansar_forgets_in_the_environment_of_a_new_command_only():

@@ -32,11 +32,11 @@ SMALL = {
 
 
 def small_config(**options):
-    """A LanSARConfig small enough for tests, with lansar-tiny untrained."""
+    """A LanSARConfig small enough for tests, with lansar-desk untrained."""
     from lerobot_lansar.clip.config import ClipConfig
     from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 
-    return LanSARConfig(**{**SMALL, "clip": ClipConfig("lansar-tiny", ""), **options})
+    return LanSARConfig(**{**SMALL, "clip": ClipConfig("lansar-desk", ""), **options})
 
 
 def thesis_network(**options):

@@ -149,7 +149,7 @@ def test_the_recommended_preset_fits_32_demonstrations_and_repeats_them(tmp_path
     )
     options = yaml.safe_load((CONFIGS / "lansar.yaml").read_text())["policy"]
     options.pop("type")
-    config = draccus.decode(LanSARConfig, options | {"clip": {"model": "lansar-tiny", "pretrained": ""}})
+    config = draccus.decode(LanSARConfig, options | {"clip": {"model": "lansar-desk", "pretrained": ""}})
     config.input_features, config.output_features = {}, {}
     torch.manual_seed(0)
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(root)).train()

@@ -22,7 +22,7 @@ from lerobot_lansar.policy.network import (
 from .conftest import thesis_network
 
 TINY = thesis_network(
-    clip=ClipConfig("lansar-tiny", ""),
+    clip=ClipConfig("lansar-desk", ""),
     hidden=24,
     context_layers=2,
     context_heads=2,

@@ -47,7 +47,7 @@ def test_lerobot_train_trains_resumes_fine_tunes_and_measures_a_held_out_loss(tm
     make_dataset(tmp_path / "data", lengths=(12, 70) * len(COMMANDS))
     data = ["--dataset.repo_id=test/desk", f"--dataset.root={tmp_path / 'data'}"]
     quick = ["--batch_size=3", "--num_workers=0", "--log_freq=1"]
-    options = {**SMALL, "clip.model": "lansar-tiny", "clip.pretrained": "", "window_start": "mixed"}
+    options = {**SMALL, "clip.model": "lansar-desk", "clip.pretrained": "", "window_start": "mixed"}
     policy = [f"--policy.{name}={str(value).lower()}" for name, value in options.items()]
     checkpoint = tmp_path / "out" / "checkpoints" / "last" / "pretrained_model"
     fresh = ["--policy.type=lansar", *policy, *data, *quick, "--steps=2", "--save_freq=2"]
@@ -133,7 +133,7 @@ def test_two_processes_train_one_policy_save_and_resume(tmp_path):
     first = [
         "--policy.type=lansar",
         *policy,
-        "--policy.clip.model=lansar-tiny",
+        "--policy.clip.model=lansar-desk",
         "--policy.clip.pretrained=",
         "--policy.dtype=bfloat16",
         "--policy.optimizer=muon",

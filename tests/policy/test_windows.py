@@ -82,7 +82,7 @@ def test_a_batch_of_windows_is_what_a_plain_loop_gives(form, target, relative, a
 def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path, monkeypatch):
     """Without a GPU: the same lookups in tensors on the CPU."""
     make_dataset(tmp_path / "data")
-    add_embeddings(tmp_path / "data", Clip(ClipConfig("lansar-tiny", ""), "cpu"))
+    add_embeddings(tmp_path / "data", Clip(ClipConfig("lansar-desk", ""), "cpu"))
     windows = make_windows(tmp_path / "data", use_images=True)
     index = np.array([3, 60, 150])
     expected = windows.batch(index)
@@ -203,7 +203,7 @@ def test_pictures_need_embeddings_of_this_dataset(tmp_path, relative):
     shutil.copytree(relative[0], root)
     with pytest.raises(FileNotFoundError, match=r"lansar-convert --embed=true"):
         make_windows(root, use_images=True)
-    clip = Clip(ClipConfig("lansar-tiny", ""))
+    clip = Clip(ClipConfig("lansar-desk", ""))
     static = add_embeddings(root, clip)
     batch = make_windows(root, use_images=True, window_start="anywhere").batch(np.array([21, 30]))
     np.testing.assert_array_equal(batch["static"][0], static[21:85].astype(np.float32))
