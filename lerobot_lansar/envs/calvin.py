@@ -12,7 +12,7 @@ import numpy as np
 
 from ..benchmark import LH_MTLC, load_chains
 from ..calvin import CAMERAS, CHAIN_LENGTH, CONTROL_HZ, CONTROL_MODES, STEPS_PER_COMMAND, TASKS
-from ..desk import Desk, DeskError, Observation, SimulationError, Snapshot, is_fulfilled
+from ..desk import Desk, DeskError, Observation, SimulationError, Snapshot, completed_tasks, is_fulfilled
 from ..desk.render import RENDERERS
 from ..desk.scenes import get_scene
 from ..desk.sentences import load_commands
@@ -26,6 +26,9 @@ from .spaces import ACTION_SIZE, action_space, observation_space, observe
 # With an episode's seed: generators apart from the one that draws its start.
 _PERTURBATION_STREAM = (4, 9)
 _SENTENCE_STREAM = (1,)
+
+_LOOK_EVERY = 5
+"""Control steps between looks at whether another task than the commanded one has been fulfilled."""
 
 LARGEST_RENDER = 1024
 """Largest width and height of what `CalvinEnv.render` returns, pixels."""
@@ -275,6 +278,7 @@ class CalvinEnv(gym.Env):
         assert self._desk is not None
         self._start: Snapshot = self._desk.snapshot()
         self._command_steps = 0
+        self._done_instead: str | None = None
         sentences = self._sentences[self._current]
         chosen = int(self._choices.integers(len(sentences))) if self.sentence == "random" else 0
         self.task_description = sentences[chosen]
@@ -286,6 +290,9 @@ class CalvinEnv(gym.Env):
         ended_early = self._reason is not None
         fulfilled = not ended_early and is_fulfilled(self._current, self._start, self._desk.snapshot())
         failed = ended_early or (not fulfilled and self._command_steps >= self.steps_per_command)
+        look = failed or self._command_steps % _LOOK_EVERY == 0
+        if look and not (fulfilled or ended_early or self._done_instead):
+            self._done_instead = min(completed_tasks(self._start, self._desk.snapshot()), default=None)
         if fulfilled or failed:
             self._outcomes.append(
                 {
@@ -293,6 +300,7 @@ class CalvinEnv(gym.Env):
                     "sentence": self.task_description,
                     "success": fulfilled,
                     "steps": self._command_steps,
+                    "done": self._current if fulfilled else self._done_instead,
                 }
             )
         return fulfilled, failed or len(self._outcomes) == len(self._commands)
@@ -324,7 +332,9 @@ class CalvinEnv(gym.Env):
     def result(self) -> dict[str, Any]:
         """The line of `episodes.jsonl` that describes the episode: what was commanded, what became of it, settings.
 
-        `end` is the state in which the episode ended; `Desk.reset` takes it.
+        A command's `done` is the task that was fulfilled first (looked for every `_LOOK_EVERY` steps), which is not
+        the commanded one where the policy misunderstood; null if none was. `end` is the state in which the episode
+        ended; `Desk.reset` takes it.
         """
         assert self._desk is not None
         return {

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..calvin import CHAIN_LENGTH
+from .figures import NOTHING
 
 INTERVALS = (
     "In brackets: 95 % intervals. Shares have Wilson's, which takes attempts as independent; averages and differences "
@@ -134,6 +135,25 @@ def _task_cell(counts: dict[str, Any] | None) -> str:
     if counts is None:
         return "not attempted"
     return f"{share_text(counts['rate'], counts['interval'])} ({counts['successes']} of {counts['attempts']})"
+
+
+def mistakes(row: dict[str, Any], most: int = 5) -> str:
+    """What became of an evaluation's commands, in a sentence with the most frequent mistakes.
+
+    Args:
+        row: An evaluation of `report.json` with "told".
+        most: How many mistakes to name.
+    """
+    told = row["told"]
+    counts = {(task, name): count for task, done in told.items() for name, count in done.items() if name != task}
+    total = sum(sum(done.values()) for done in told.values())
+    nothing = sum(count for (_, name), count in counts.items() if name == NOTHING)
+    wrong = {pair: count for pair, count in counts.items() if pair[1] != NOTHING}
+    text = f"of {total} commands {total - sum(counts.values())} were carried out, {nothing} led to nothing and "
+    text += f"{sum(wrong.values())} to another task first"
+    most_often = sorted(wrong.items(), key=lambda item: (-item[1], item[0]))[:most]
+    named = ", ".join(f"{name} instead of {task} ({count})" for (task, name), count in most_often)
+    return f"{text}; most often {named}" if named else text
 
 
 def distinct(report: dict[str, Any]) -> list[dict[str, Any]]:

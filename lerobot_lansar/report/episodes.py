@@ -47,6 +47,7 @@ class Episode:
         settings: The known ones of `SETTINGS`.
         reason: Why it ended before its time: an action that the desk refused, or a simulation that diverged.
         steps: Control steps that each command took; empty if unknown.
+        done: The task that was fulfilled first after each command, None if none was; empty if unknown.
         origin: The known ones of policy, policy_reset and version.
     """
 
@@ -56,6 +57,7 @@ class Episode:
     settings: dict[str, Any] = field(default_factory=dict)
     reason: str | None = None
     steps: list[int] = field(default_factory=list)
+    done: list[str | None] = field(default_factory=list)
     origin: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -158,6 +160,7 @@ def _from_line(line: dict[str, Any]) -> Episode:
         {key: line[key] for key in SETTINGS if key in line},
         line.get("reason"),
         [int(command["steps"]) for command in line["commands"] if "steps" in command],
+        [command["done"] for command in line["commands"] if "done" in command],
         {key: line[key] for key in ("policy", "policy_reset", "version") if line.get(key) is not None},
     )
 

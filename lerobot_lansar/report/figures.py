@@ -11,6 +11,9 @@ from .episodes import Episode
 LEVEL = 0.95
 """Of every interval."""
 
+NOTHING = "nothing"
+"""What was done where no task was fulfilled."""
+
 RESAMPLES = 9999
 """Bootstrap samples; the draws are the same in every report."""
 
@@ -72,7 +75,8 @@ def figures(episodes: list[Episode]) -> dict[str, Any]:
     Returns:
         {"tasks": {task: what `share` returns}, "local_success_rate", "local_success_rate_interval"} and, if there are
         chains, {"in_a_row": [share of chains with at least 1…5], "in_a_row_intervals", "average_length",
-        "average_length_interval"}. The average length is the sum of the five shares; the local success rate is the
+        "average_length_interval"} and, if the lines tell what was done, {"told": {task: {task that was done first, or
+        "nothing": how often}}}. The average length is the sum of the five shares; the local success rate is the
         share of attempted commands that were fulfilled.
     """
     counts: dict[str, list[int]] = {}
@@ -94,7 +98,19 @@ def figures(episodes: list[Episode]) -> dict[str, Any]:
         found["in_a_row_intervals"] = [wilson(count, len(lengths)) for count in rows]
         found["average_length"] = sum(found["in_a_row"])
         found["average_length_interval"] = bootstrap([lengths])[0]
+    if all(episode.done for episode in episodes):
+        found["told"] = _told(episodes)
     return found
+
+
+def _told(episodes: list[Episode]) -> dict[str, dict[str, int]]:
+    """Each commanded task to what was done: {task, or "nothing": how often}."""
+    told: dict[str, dict[str, int]] = {}
+    for episode in episodes:
+        for (task, _), done in zip(episode.commands, episode.done, strict=True):
+            row = told.setdefault(task, {})
+            row[done or NOTHING] = row.get(done or NOTHING, 0) + 1
+    return told
 
 
 def difference(episodes: list[Episode], baseline: list[Episode]) -> dict[str, Any] | None:

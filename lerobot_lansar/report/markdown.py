@@ -12,6 +12,7 @@ from .cells import (
     distinct,
     facts,
     in_a_row_rows,
+    mistakes,
     task_rows,
 )
 from .notes import grouped, missing_text
@@ -55,6 +56,7 @@ def _table(table: dict[str, Any]) -> list[str]:
         for row in table["evaluations"]:
             local = f"{100 * row['local_success_rate']:.2f} %" + bracket(row["local_success_rate_interval"], 100, 1)
             lines.append(f"* {row['label']}: local success rate (all attempted commands) {local}")
+        lines += [f"* {row['label']}: {mistakes(row)}" for row in table["evaluations"] if "told" in row]
     lines += [f"* published: {published['source']}" for published in table["published"]]
     return [*lines, "", INTERVALS]
 

@@ -19,6 +19,7 @@ from .cells import (
     distinct,
     facts,
     in_a_row_rows,
+    mistakes,
     task_rows,
 )
 from .episodes import Episode
@@ -75,6 +76,11 @@ def _table(table: dict[str, Any], number: int) -> dict[str, Any]:
         "differences": (DIFFERENCE_HEADER, difference_rows(table)) if table["differences"] else None,
         "tasks": task_rows(table) if tasks else None,
         "tasks_plot": plots.plot_tasks(table, f"tasks-{number}") if tasks else "",
+        "told": [
+            (row["label"], mistakes(row), plots.plot_told(row, f"told-{number}-{i}"))
+            for i, row in enumerate(table["evaluations"])
+            if tasks and "told" in row
+        ],
     }
 
 

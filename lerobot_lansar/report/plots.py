@@ -6,8 +6,10 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure  # without pyplot, which takes half a second more to import
+from matplotlib.patches import Rectangle
 
-from ..calvin import CHAIN_LENGTH
+from ..calvin import CHAIN_LENGTH, TASKS
+from .figures import NOTHING
 
 COLOURS = ("#3b7dbb", "#d0762b", "#3f9a5d", "#a565b8", "#c4504f", "#8a7a52", "#4aa3a0", "#7d7f8a")
 """Of evaluations and trainings in their order; readable on white and on near black."""
@@ -86,6 +88,36 @@ def plot_tasks(table: dict[str, Any], salt: str) -> str:
         axes.margins(y=0.01)
         _legend(figure)
         return _svg(figure, f"Success of each task: {', '.join(row['label'] for row in rows)}")
+
+
+def plot_told(row: dict[str, Any], salt: str) -> str:
+    """A matrix: the commanded task (rows) against the one that was fulfilled first (columns), in percent of attempts.
+
+    Args:
+        row: An evaluation of `report.json` with "told".
+        salt: As for `plot_in_a_row`.
+    """
+    told = row["told"]
+    done = {name for counts in told.values() for name in counts}
+    rows = [task for task in TASKS if task in told]
+    columns = [task for task in TASKS if task in told or task in done] + [NOTHING]
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": salt}):
+        figure = Figure(figsize=(2.2 + 0.2 * len(columns), 2 + 0.2 * len(rows)))
+        axes = figure.subplots()
+        for y, task in enumerate(rows):
+            attempts = sum(told[task].values())
+            for name, count in told[task].items():
+                x, share = columns.index(name), count / attempts
+                colour = COLOURS[0 if name == task else -1 if name == NOTHING else 1]
+                axes.add_patch(
+                    Rectangle((x - 0.5, y - 0.5), 1, 1, color=colour, alpha=0.15 + 0.75 * share, linewidth=0)
+                )
+                axes.text(x, y, f"{100 * share:.0f}", ha="center", va="center", fontsize=6.5)
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
+        axes.set_yticks(range(len(rows)), rows, fontsize=8)
+        axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel="done first", ylabel="told")
+        axes.tick_params(length=0)
+        return _svg(figure, f"What {row['label']} did first, by what it was told")
 
 
 def plot_losses(trainings: list[dict[str, Any]], salt: str) -> str:

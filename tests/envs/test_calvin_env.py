@@ -97,6 +97,7 @@ def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_pat
     assert episode["successes"] == 2
     assert [c["success"] for c in episode["commands"]] == [True, True, False]
     assert episode["commands"][2]["steps"] == 200
+    assert [c["done"] for c in episode["commands"]] == [*tasks[:2], None]
     assert episode["reason"] is None
     assert episode["sentence"] == "first"
     env.close()
@@ -184,8 +185,26 @@ def test_a_wild_action_fails_its_episode_and_says_why(tmp_path, mode, value, rea
     (line,) = map(json.loads, (tmp_path / EPISODES_FILE).read_text().splitlines())
     assert re.search(reason, line["reason"])
     assert line["commands"] == [
-        {"task": "turn_on_led", "sentence": env._sentences["turn_on_led"][0], "success": False, "steps": 2}
+        {
+            "task": "turn_on_led",
+            "sentence": env._sentences["turn_on_led"][0],
+            "success": False,
+            "steps": 2,
+            "done": None,
+        }
     ]
+
+
+def test_the_line_says_which_task_was_done_instead_of_the_commanded_one(tmp_path):
+    env = CalvinEnv("close_drawer", control_mode="abs", cameras=(), steps_per_command=150, results_dir=str(tmp_path))
+    seed = next(seed for seed in range(20) if not env.reset(seed=seed)[0]["environment_state"][5])
+    obs, _ = env.reset(seed=seed)
+    *_, result = script(env, obs, ["turn_on_led"])
+    while not result[2]:
+        result = env.step(np.r_[result[0]["agent_pos"][:6], 1])
+    env.close()
+    (line,) = map(json.loads, (tmp_path / EPISODES_FILE).read_text().splitlines())
+    assert [(c["task"], c["success"], c["done"]) for c in line["commands"]] == [("close_drawer", False, "turn_on_led")]
 
 
 def test_an_action_of_another_size_stops_the_run():

@@ -21,15 +21,21 @@ def write_eval(folder, *groups):
 
 
 def write_lines(folder, rows, **settings):
-    """Writes (seed, chain, [(task, success)]) rows as lines of the environment; a setting of None is unknown."""
+    """Writes rows as lines of the environment; a setting of None is unknown.
+
+    A row is (seed, chain, [(task, success)]), or with (task, success, done) where it is known what was done.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for seed, chain, commands in rows:
         line = {
             "seed": seed,
             "chain": chain,
             "scene": "D",
-            "commands": [{"task": t, "sentence": t, "success": s, "steps": 9} for t, s in commands],
-            "successes": sum(s for _, s in commands),
+            "commands": [
+                {"task": t, "sentence": t, "success": s, "steps": 9, **({"done": done[0]} if done else {})}
+                for t, s, *done in commands
+            ],
+            "successes": sum(s for _, s, *_ in commands),
             "assets": "built-in",
             "control_mode": "rel",
             "steps_per_command": 360,

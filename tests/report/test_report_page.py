@@ -1,5 +1,6 @@
 """The page: what is in it, and that a real browser shows it on a phone, without script and with."""
 
+import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -26,9 +27,18 @@ class Elements(HTMLParser):
         return [attrs[name] for _, attrs in self.found if name in attrs]
 
 
-def chains(folder, lengths, policy, videos=()):
-    """An evaluation of chains 0, 1, … with so many commands fulfilled, and videos of some."""
-    write_lines(folder, [chain_line(k, length) for k, length in enumerate(lengths)], policy=policy)
+def chains(folder, lengths, policy, videos=(), instead=()):
+    """An evaluation of chains 0, 1, … with so many commands fulfilled, and videos of some.
+
+    `instead`: what was done instead of each chain's command that failed, if that is known.
+    """
+    rows = [chain_line(k, length) for k, length in enumerate(lengths)]
+    if instead:
+        rows = [
+            (seed, chain, [(task, success, task if success else done) for task, success in commands])
+            for (seed, chain, commands), done in zip(rows, instead, strict=True)
+        ]
+    write_lines(folder, rows, policy=policy)
     write_plan(folder, n_episodes=len(lengths), command=f"lansar-eval --policy.path={policy}")
     for number in videos:
         file = folder / f"videos/lh_mtlc_0/eval_episode_{number}.mp4"
@@ -42,7 +52,8 @@ def single(tmp_path_factory):
     """The page of one evaluation of 60 chains."""
     folder = tmp_path_factory.mktemp("single")
     policy = write_policy(folder / "policy", "state", "environment_state")
-    chains(folder / "eval", [5, 0, 3, 1, 2] * 12, policy, videos=(0, 1))
+    instead = [None, "stack_block", None, "turn_on_led", None] * 12
+    chains(folder / "eval", [5, 0, 3, 1, 2] * 12, policy, videos=(0, 1), instead=instead)
     report(ReportConfig(str(folder / "eval"), folder / "report"))
     return folder / "report/report.html"
 
@@ -118,10 +129,22 @@ def test_ids_are_unique_and_refer_to_something(single, several):
 def test_plots_name_themselves_and_take_the_pages_colours(single):
     text = single.read_text()
     plots = [attrs for tag, attrs in Elements(text).found if tag == "svg"]
-    assert [plot["role"] for plot in plots] == ["img", "img"]
+    assert [plot["role"] for plot in plots] == ["img", "img", "img"]
+    assert plots[2]["aria-label"] == "What policy did first, by what it was told"
     assert plots[0]["aria-label"] == "Success of 1 to 5 commands in a row: policy"
     assert "currentColor" in text
     assert ">commands in a row</text>" in text, "text stays text"
+
+
+def test_what_was_done_stands_beside_what_was_told(single, several):
+    told = json.loads((single.parent / "report.json").read_text())["tables"][0]["evaluations"][0]["told"]
+    failed = load_chains()[1].tasks[0]
+    assert told[failed]["stack_block"] >= 1
+    assert sum(sum(done.values()) for done in told.values()) == 180
+    sentence = "of 180 commands 132 were carried out, 24 led to nothing and 24 to another task first"
+    assert sentence in single.read_text()
+    assert sentence in (single.parent / "report.md").read_text()
+    assert "Told and done" not in several.read_text(), "older lines do not say"
 
 
 def test_labels_are_text_not_markup(several):
