@@ -80,7 +80,7 @@ class Options:
     sessions: int = 120
     workers: int = 2
     # Updates.
-    steps: int = 6000
+    steps: int = 3000
     # Pictures of each camera in an update.
     batch_size: int = 96
     learning_rate: float = 1e-3
@@ -341,7 +341,7 @@ def train(options: Options) -> None:
     def see(pictures: Tensor) -> Tensor:
         with torch.autocast(clip.device.type, torch.bfloat16):  # half the time on a CPU that has it
             x = _augment(pictures, generator).to(clip.device, memory_format=torch.channels_last)
-            return clip.images.embed(x).float()
+            return model.encode_image(clip.images.normalize(x)).float()
 
     def read(texts: list[str]) -> Tensor:
         return F.normalize(model.encode_text(clip.tokenizer(texts).to(clip.device)), dim=-1)
@@ -377,8 +377,15 @@ def train(options: Options) -> None:
             if step % 20 == 0:
                 bar.set_postfix({name: f"{mean:.3f}" for name, mean in means.items()})
     state = {name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()}
-    save_file(state, options.output, {"trained_with": " ".join(["python", *sys.argv])})
+    settings = {name: getattr(options, name) for name in ("steps", "batch_size", "learning_rate", "seed")}
+    partial = options.output.with_suffix(".partial")
+    save_file(state, partial, {"trained_by": "scripts/train_clip.py", "moments": str(len(data)), **_texts(settings)})
+    partial.rename(options.output)
     print(f"{options.output}: {options.output.stat().st_size / 1e6:.1f} MB; losses {means}")
+
+
+def _texts(settings: dict[str, object]) -> dict[str, str]:
+    return {name: str(value) for name, value in settings.items()}
 
 
 CENTRES = {

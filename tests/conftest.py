@@ -28,6 +28,12 @@ def golden() -> Path:
 
 
 @pytest.fixture(scope="session")
+def spec() -> Path:
+    """The thesis and notes on CALVIN, as text."""
+    return _shared("spec")
+
+
+@pytest.fixture(scope="session")
 def original_assets() -> Path:
     """The original CALVIN asset files."""
     return _shared("calvin_assets")

@@ -143,6 +143,17 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
         "--output_dir=eval_tuned",
     )
     assert len(successes(work, "eval_tuned")[0]) == 2
+    printed = run(
+        "lansar-eval",
+        f"--policy.path={tuned}",
+        *EVALUATION,
+        "--env.cameras=[]",
+        "--chains=1",
+        "--workers=1",
+        "--output_dir=eval_blind",
+        fails=True,
+    )
+    assert "Evaluate with --env.cameras" in printed
 
 
 def successes(work, folder):

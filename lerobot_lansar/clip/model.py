@@ -127,16 +127,25 @@ class ImageEncoder(nn.Module):
                 f"images must be uint8 (B, H, W, 3) or float (B, 3, H, W) in [0, 1], got {x.dtype} {tuple(x.shape)}."
             )
         x = x.to(self.mean.device, torch.float32)
+        if tuple(x.shape[-2:]) == self.size:
+            return x
         # CALVIN's pictures are square, so a plain resize is open_clip's resize and centre crop.
         return F.interpolate(x, self.size, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
 
-    def embed(self, pictures: Tensor) -> Tensor:
-        """(B, 3, S, S) in [0, 1] -> (B, D)."""
-        return self.visual((pictures - self.mean) / self.std)
+    def normalize(self, pictures: Tensor) -> Tensor:
+        """(B, 3, S, S) in [0, 1] -> what the encoder reads."""
+        return (pictures - self.mean) / self.std
 
     def forward(self, images: Tensor | np.ndarray) -> Tensor:
-        """Pictures as `resize` takes them -> (B, D)."""
-        return self.embed(self.resize(images))
+        """Pictures as `resize` takes them -> (B, D).
+
+        Raises:
+            ValueError: This encoder has other outputs beside the embedding.
+        """
+        found = self.visual(self.normalize(self.resize(images)))
+        if not isinstance(found, Tensor):
+            raise ValueError("--policy.finetune_clip=true: the image encoder of this CLIP gives more than an embedding")
+        return found
 
 
 class Clip:
@@ -146,6 +155,7 @@ class Clip:
         config: Model and weights.
         device: Where the encoders run.
         weights: A state dict to use instead of `config.pretrained` (from a checkpoint).
+        load: False: the weights stay random, since others will replace them.
 
     Attributes:
         embed_dim: D.
@@ -156,28 +166,36 @@ class Clip:
     """
 
     def __init__(
-        self, config: ClipConfig, device: str | torch.device = "cpu", weights: dict[str, Tensor] | None = None
+        self,
+        config: ClipConfig,
+        device: str | torch.device = "cpu",
+        weights: dict[str, Tensor] | None = None,
+        load: bool = True,
     ) -> None:
         open_clip = _open_clip()
         self.config = config
         self.embed_dim = embedding_size(config.model)
         tag = open_clip.get_pretrained_cfg(config.model, config.pretrained) if config.pretrained else {}
         pretrained = str(_packaged_weights(config) or config.pretrained)
-        if weights is None and pretrained and not tag and not Path(pretrained).is_file():
-            ours = [file.stem.removeprefix(f"{config.model}-") for file in CLIP_MODELS.glob(f"{config.model}-*")]
+        load = load and bool(pretrained) and weights is None
+        if load and not tag and not Path(pretrained).is_file():
+            files = CLIP_MODELS.glob(f"{config.model}-*.safetensors")
+            ours = sorted(file.stem.removeprefix(f"{config.model}-") for file in files)
             tags = ", ".join([*open_clip.list_pretrained_tags_by_model(config.model), *ours]) or "it has none"
             raise ValueError(
                 f"clip.pretrained={config.pretrained!r} is neither a weights file nor a tag of {config.model} ({tags})."
             )
         # open_clip warns about random weights; here that is intended, or a checkpoint follows.
         with torch.random.fork_rng(devices=[]), _quiet_logging():
-            torch.manual_seed(0)  # the same random weights every time, without touching the caller's generator
+            # The same random weights every time, without touching the caller's generators, those of GPUs included.
+            torch.default_generator.manual_seed(0)
             model = open_clip.create_model(
                 config.model,
-                pretrained=pretrained if weights is None and pretrained else None,
+                pretrained=pretrained if load else None,
                 # Some tags (ViT-B-32/openai) were trained with another activation than their model's file says;
                 # open_clip only warns, and the embeddings would be wrong.
                 force_quick_gelu=bool(tag.get("quick_gelu", False)),
+                force_preprocess_cfg={key: tag[key] for key in ("mean", "std") if key in tag},
             )
         if weights is not None:
             model.load_state_dict(weights)
@@ -206,7 +224,7 @@ class Clip:
     def encode_images(self, images: Tensor | np.ndarray) -> Tensor:
         """Embeds pictures, (B, D) float32 on this CLIP's device; see `ImageEncoder.resize` for what it takes."""
         with self._full_precision():
-            return self.images(images)
+            return self.model.encode_image(self.images.normalize(self.images.resize(images)))
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Tensor:

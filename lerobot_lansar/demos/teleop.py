@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from ..calvin import CONTROL_HZ, GRIPPER_ACTION, POSE_UNITS, TASKS, TCP_POSE, relative_action, wrap_angle
+from ..calvin import CAMERAS, CONTROL_HZ, GRIPPER_ACTION, POSE_UNITS, TASKS, TCP_POSE, relative_action, wrap_angle
 from ..command import run_command
 from ..desk import Desk, DeskError, Observation
 from ..desk.sentences import load_commands
@@ -285,7 +285,8 @@ def teleoperate(config: TeleopConfig) -> Session:
     path = config.video
     if path is None and pygame is None:
         path = Path("play.mp4")
-    with Desk(config.scene, config.assets, renderer=config.renderer) as desk:
+    cameras = () if config.output_dir is None else tuple(CAMERAS)  # pictures are recorded, or else only shown
+    with Desk(config.scene, config.assets, cameras, config.renderer) as desk:
         session = Session(config, desk)
         if config.output_dir is not None:  # left by a session that was killed
             shutil.rmtree(config.output_dir / STAGING, ignore_errors=True)

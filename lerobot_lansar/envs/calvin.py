@@ -288,11 +288,12 @@ class CalvinEnv(gym.Env):
         """Whether the last step fulfilled the command, and whether it ended the episode; notes how a command ended."""
         assert self._desk is not None
         ended_early = self._reason is not None
-        fulfilled = not ended_early and is_fulfilled(self._current, self._start, self._desk.snapshot())
+        now = self._desk.snapshot()
+        fulfilled = not ended_early and is_fulfilled(self._current, self._start, now)
         failed = ended_early or (not fulfilled and self._command_steps >= self.steps_per_command)
         look = failed or self._command_steps % _LOOK_EVERY == 0
         if look and not (fulfilled or ended_early or self._done_instead):
-            self._done_instead = min(completed_tasks(self._start, self._desk.snapshot()), default=None)
+            self._done_instead = min(completed_tasks(self._start, now), default=None)
         if fulfilled or failed:
             self._outcomes.append(
                 {
@@ -332,9 +333,9 @@ class CalvinEnv(gym.Env):
     def result(self) -> dict[str, Any]:
         """The line of `episodes.jsonl` that describes the episode: what was commanded, what became of it, settings.
 
-        A command's `done` is the task that was fulfilled first (looked for every `_LOOK_EVERY` steps), which is not
-        the commanded one where the policy misunderstood; null if none was. `end` is the state in which the episode
-        ended; `Desk.reset` takes it.
+        A command's `done` is the commanded task if it was fulfilled. Else it is the task that was fulfilled first
+        (looked for every `_LOOK_EVERY` steps; of several the first in alphabetical order), or null. `end` is the state
+        in which the episode ended; `Desk.reset` takes it.
         """
         assert self._desk is not None
         return {

@@ -46,7 +46,7 @@ def card_text(config: LanSARConfig, run: TrainPipelineConfig | None) -> str:
     """
     inputs = "the state of robot, blocks and furniture" if config.use_spatial_context else "the state of the robot"
     if config.use_images:
-        inputs += ", two pictures as CLIP embeddings"
+        inputs += ", two pictures as embeddings by " + ("its own image encoder" if config.finetune_clip else "CLIP")
     facts = {"CLIP": f"{config.clip.model} {config.clip.pretrained}", "learning rate": config.learning_rate}
     if run is not None:
         dataset = run.dataset.repo_id

@@ -129,7 +129,7 @@ class LanSARConfig(PreTrainedConfig):
     # CLIP's image encoder is trained with the policy (section 6.5.1), which needs a GPU for more than a trial; a window
     # then costs two pictures a step. Pictures are read from the dataset, decoded once into its folder.
     finetune_clip: bool = False
-    # Peak learning rate of the image encoder.
+    # Peak learning rate of the image encoder; with --use_policy_training_preset=false it has that of everything else.
     clip_learning_rate: float = 1e-5
 
     # Upload the trained policy; needs --policy.repo_id=you/name.

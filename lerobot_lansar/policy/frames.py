@@ -147,12 +147,20 @@ def load_pictures(root: Path, size: int, resize: Callable[[Tensor], Tensor]) -> 
         {"static": (total_frames, H, W, 3) uint8, "gripper": ...}, memory-mapped.
 
     Raises:
-        ValueError: The dataset lacks one of the two cameras.
+        ValueError: The dataset lacks one of the two cameras, or its folder cannot be written to or has not the space.
+        FileNotFoundError: Video files are missing.
     """
-    folder = root / f"{CACHE}_pictures" / f"{dataset_fingerprint(root)[:16]}-{size}"
+    parent = root / f"{CACHE}_pictures"
+    folder = parent / f"{dataset_fingerprint(root)[:16]}-{size}"
     if not folder.is_dir():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder.with_suffix(".lock")):
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(
+                f"--policy.finetune_clip=true keeps decoded pictures in {parent}, which cannot be made "
+                f"({error.strerror}): copy the dataset to a folder that can be written to."
+            ) from error
+        with FileLock(parent / "lock"):
             if not folder.is_dir():
                 _decode_pictures(root, size, resize, folder.with_suffix(".partial"))
                 folder.with_suffix(".partial").rename(folder)
@@ -161,21 +169,36 @@ def load_pictures(root: Path, size: int, resize: Callable[[Tensor], Tensor]) -> 
 
 def _decode_pictures(root: Path, size: int, resize: Callable[[Tensor], Tensor], folder: Path) -> None:
     """Writes the files of `load_pictures`; `progress.json` says how many frames they hold."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # takes seconds
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata  # takes seconds
 
-    dataset = LeRobotDataset("local/pictures", root=root)
-    missing = set(IMAGE_FEATURES.values()) - set(dataset.meta.camera_keys)
+    meta = LeRobotDatasetMetadata("local/pictures", root=root)
+    missing = set(IMAGE_FEATURES.values()) - set(meta.camera_keys)
     if missing:
         raise ValueError(
             f"--policy.finetune_clip=true needs the dataset's pictures, but {root} has no "
             f"{', '.join(sorted(missing))}: convert it with --images=video or png."
         )
+    for feature in set(IMAGE_FEATURES.values()) & set(meta.video_keys):
+        for episode in range(meta.total_episodes):
+            if not (root / meta.get_video_file_path(episode, feature)).is_file():
+                raise FileNotFoundError(
+                    f"{root} lacks {meta.get_video_file_path(episode, feature)}: with --policy.finetune_clip=true "
+                    "download the whole dataset, without --dataset.episodes."
+                )
+    sides = {c: min(size, *sorted(meta.features[f]["shape"])[1:]) for c, f in IMAGE_FEATURES.items()}
+    needed, free = sum(3 * side**2 for side in sides.values()) * meta.total_frames, shutil.disk_usage(root).free
+    if not folder.exists() and needed > free:
+        raise ValueError(
+            f"--policy.finetune_clip=true decodes the dataset's pictures into its folder {root}, which takes "
+            f"{needed / 1e9:.0f} GB; {free / 1e9:.0f} GB are free."
+        )
+    dataset = LeRobotDataset("local/pictures", root=root)
     folder.mkdir(exist_ok=True)
     progress = folder / "progress.json"
     done = json.loads(progress.read_text()) if progress.exists() else 0
     arrays: dict[str, np.ndarray] = {}
-    for camera, feature in IMAGE_FEATURES.items():
-        file, side = folder / f"{camera}.npy", min(size, *sorted(dataset.meta.features[feature]["shape"])[1:])
+    for camera, side in sides.items():
+        file = folder / f"{camera}.npy"
         arrays[camera] = (
             np.load(file, mmap_mode="r+")
             if done

@@ -14,9 +14,9 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from ..calvin import ANGLE_UNIT, CONTROL_MODES, GRIPPER_ACTION, POSITION_UNIT, TCP_POSE
-from ..clip.config import ClipConfig
 from ..clip.model import Clip, ImageEncoder
 from ..clip.store import IMAGE_FEATURES
 from .card import card_text
@@ -24,7 +24,7 @@ from .configuration_lansar import LanSARConfig
 from .losses import Losses
 from .network import LanSARNetwork
 from .optimizer import parameter_groups
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, COUNTS, START, VALID_STEPS
+from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, COUNTS, START, VALID_STEPS, picture_of
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
 from .windows import Windows, set_current
 
@@ -104,16 +104,16 @@ class LanSARPolicy(PreTrainedPolicy):
         self._losses: Losses | None = None  # in training only
         self.scaler = Scaler(config.orientation, config.egocentric_blocks, config.since_command)
         self.network = LanSARNetwork(config.network)
-        self.image_encoder: ImageEncoder | None = None
-        if config.finetune_clip:
-            # Only a training starts from CLIP's weights; whoever loads a checkpoint gets its own.
-            pretrained = config.clip.pretrained if dataset_meta is not None else ""
-            self.image_encoder = Clip(ClipConfig(config.clip.model, pretrained)).images.requires_grad_(True)
-            # safetensors saves no other format
-            self.image_encoder.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-            self.image_encoder.visual.set_grad_checkpointing()  # or the activations fill any GPU
         if dataset_meta is not None:
             self._check_pretrained()
+        self.image_encoder: ImageEncoder | None = None
+        if config.finetune_clip:
+            # Only a new training starts from CLIP's weights; a checkpoint has its own.
+            clip = Clip(config.clip, load=dataset_meta is not None and not config.pretrained_path)
+            self.image_encoder = clip.images.requires_grad_(True)
+            # safetensors saves no other format
+            self.image_encoder.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        if dataset_meta is not None:
             root, features = dataset_meta.root, dataset_meta.features
             windows = Windows(root, features, dataset_meta.total_frames, config, self.image_encoder)
             _drop_videos(features)
@@ -245,7 +245,7 @@ class LanSARPolicy(PreTrainedPolicy):
         """The embeddings of both cameras' pictures at all steps, (B, n, D) each, 0 where there is padding."""
         assert self.image_encoder is not None
         valid_steps, shape = batch[VALID_STEPS], batch[OBS_STATE].shape[:2]
-        found = [self.image_encoder(batch[key]) for key in IMAGE_FEATURES.values()]  # (N, D)
+        found = [embed_in_parts(self.image_encoder, batch[key]) for key in IMAGE_FEATURES.values()]  # (N, D)
         return [e.new_zeros(shape.numel(), e.shape[1]).index_copy(0, valid_steps, e).unflatten(0, shape) for e in found]
 
     def _add_noise(self, state: Tensor) -> Tensor:
@@ -283,7 +283,7 @@ class LanSARPolicy(PreTrainedPolicy):
         self._clear_old_histories(batch["task"])
         with torch.autocast(state.device.type, enabled=False):  # mixed precision does not speed up a single step
             if self.image_encoder is not None:
-                inputs += [self.image_encoder(batch[key]) for key in IMAGE_FEATURES.values()]
+                inputs += [self.image_encoder(picture_of(batch, key)) for key in IMAGE_FEATURES.values()]
             elif self.config.use_images:
                 inputs += [batch[key] for key in CLIP_IMAGE.values()]
             motion, logit = self._predict(*inputs)
@@ -420,10 +420,17 @@ class LanSARPolicy(PreTrainedPolicy):
         return card
 
 
+def embed_in_parts(encoder: ImageEncoder, pictures: Tensor, size: int = 256) -> Tensor:
+    """(N, H, W, 3) -> (N, D), a part at a time: the gradient recomputes a part's activations, since those of all
+    pictures of a batch of windows would fill any GPU."""
+    return torch.cat([checkpoint(encoder, part, use_reentrant=False) for part in pictures.split(size)])
+
+
 def _drop_videos(features: dict[str, dict]) -> None:
     """Removes the videos from a dataset's features, in place.
 
-    LeRobot decodes every video among them for each sample, but LanSAR reads embeddings instead. The features are the
+    LeRobot decodes every video among them for each sample, but LanSAR reads embeddings, or pictures that were decoded
+    before. The features are the
     dataset's own, looked at for each sample. What a checkpoint holds of them was taken before.
     """
     for name in [name for name, feature in features.items() if feature["dtype"] == "video"]:

@@ -7,6 +7,8 @@
       ClipStep      embeds the task sentence              embeds the task sentence
                     (pictures are embedded already)       and the pictures
 
+With `finetune_clip` the policy itself embeds pictures.
+
 The batch then holds, in training and (without the axis n) in evaluation:
 
     observation.state              (B, n, 15)
@@ -110,6 +112,20 @@ class WindowStep(ProcessorStep):
         return features
 
 
+def picture_of(observation: dict[str, Any], key: str) -> Tensor:
+    """An observation's pictures from one camera.
+
+    Raises:
+        ValueError: There are none.
+    """
+    if key not in observation:
+        raise ValueError(
+            f"This LanSAR reads pictures, but there is no {key}. Evaluate with "
+            "--env.cameras='[static,gripper]', or train one without pictures (--policy.use_images=false)."
+        )
+    return observation[key]
+
+
 @ProcessorStepRegistry.register("lansar_clip")
 @dataclass
 class ClipStep(ProcessorStep):
@@ -169,18 +185,10 @@ class ClipStep(ProcessorStep):
         if self.use_images:
             for name, key in CLIP_IMAGE.items():
                 if key not in observation:
-                    observation[key] = self._embed(clip, observation, IMAGE_FEATURES[name])
+                    observation[key] = clip.encode_images(picture_of(observation, IMAGE_FEATURES[name]))
         new = transition.copy()
         new[TransitionKey.OBSERVATION] = observation
         return new
-
-    def _embed(self, clip: Clip, observation: dict[str, Any], key: str) -> Tensor:
-        if key not in observation:
-            raise ValueError(
-                f"This LanSAR reads pictures, but there is no {key}. Evaluate with "
-                "--env.cameras='[static,gripper]', or train one without pictures (--policy.use_images=false)."
-            )
-        return clip.encode_images(observation[key])
 
     def get_config(self) -> dict[str, Any]:
         sha256 = self.clip().weights_sha256

@@ -134,13 +134,14 @@ class Windows:
         elif config.use_images:
             self._load_embeddings(root, total_frames, config)
         self.paraphrases = config.paraphrases
-        needed = config.paraphrases or config.contrastive_weight
-        self.sentence_tasks = load_sentence_tasks(root) if needed else {}
+        self.contrasts = config.contrastive_weight > 0
+        self.sentence_tasks = load_sentence_tasks(root) if self.paraphrases or self.contrasts else {}
         self._paraphrases_of = find_paraphrases(self.sentence_tasks)
         known = sorted(set[int]().union(*self.sentence_tasks.values()))
         self._task_rows = {s: [float(task in tasks) for task in known] for s, tasks in self.sentence_tasks.items()}
         self.device = torch.device(config.device or "cpu")
-        self._move_to_gpu()
+        self.on_gpu = self._move_to_gpu(self.arrays, self.embeddings)
+        self.pictures_on_gpu = self._move_to_gpu(self.pictures)
 
     @property
     def is_demonstrated(self) -> np.ndarray:
@@ -225,9 +226,9 @@ class Windows:
         frame_rows, embedding_rows = rows, self.frames["index"][rows] if self.embeddings else rows
         picture_rows = self.frames["index"][rows.flat[valid_steps]] if self.pictures else valid_steps
         if self.on_gpu:
-            frame_rows, embedding_rows, picture_rows = (
-                torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows, picture_rows)
-            )
+            frame_rows, embedding_rows = (torch.from_numpy(r).to(self.device) for r in (frame_rows, embedding_rows))
+        if self.pictures_on_gpu:
+            picture_rows = torch.from_numpy(picture_rows).to(self.device)
         found = {name: array[frame_rows] for name, array in self.arrays.items()}
         found |= {name: array[embedding_rows] for name, array in self.embeddings.items()}
         if self.since_command:
@@ -248,20 +249,20 @@ class Windows:
         return [sentences[int(draw * len(sentences))] for sentences, draw in zip(choices, draws, strict=True)]
 
     def command_tasks(self, commands: list[str]) -> Tensor | None:
-        """(B, tasks) float32, 1 for the CALVIN tasks that each command can mean; None where nothing needs them."""
-        if not self.sentence_tasks:
+        """(B, tasks) float32, 1 for the CALVIN tasks that each command can mean; None without the contrastive loss."""
+        if not self.contrasts:
             return None
         return torch.tensor([self._task_rows[command] for command in commands])
 
-    def _move_to_gpu(self) -> None:
-        """Moves the arrays to the GPU if they take at most half of its free memory: lookups then need no transfer."""
-        groups = self.arrays, self.embeddings, self.pictures
+    def _move_to_gpu(self, *groups: dict[str, np.ndarray | Tensor]) -> bool:
+        """Moves arrays to the GPU if they take at most half of its free memory: lookups then need no transfer."""
         size = sum(array.nbytes for arrays in groups for array in arrays.values())
-        self.on_gpu = self.device.type == "cuda" and size <= torch.cuda.mem_get_info(self.device)[0] / 2
-        if self.on_gpu:
+        fits = self.device.type == "cuda" and size <= torch.cuda.mem_get_info(self.device)[0] / 2
+        if fits:
             for arrays in groups:
                 for name, array in arrays.items():
                     arrays[name] = torch.tensor(array, device=self.device)
+        return fits
 
 
 _current: list[Windows] = []

@@ -47,7 +47,8 @@ class Episode:
         settings: The known ones of `SETTINGS`.
         reason: Why it ended before its time: an action that the desk refused, or a simulation that diverged.
         steps: Control steps that each command took; empty if unknown.
-        done: The task that was fulfilled first after each command, None if none was; empty if unknown.
+        done: For each command its task if it was fulfilled, else the other task that was fulfilled first, or None;
+            empty if unknown.
         origin: The known ones of policy, policy_reset and version.
     """
 
@@ -57,7 +58,7 @@ class Episode:
     settings: dict[str, Any] = field(default_factory=dict)
     reason: str | None = None
     steps: list[int] = field(default_factory=list)
-    done: list[str | None] = field(default_factory=list)
+    done: list[str | None] = field(default_factory=list, compare=False)
     origin: dict[str, Any] = field(default_factory=dict)
 
     @property

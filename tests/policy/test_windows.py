@@ -268,12 +268,14 @@ def test_a_paraphrase_means_the_same_tasks(tmp_path):
     shown = [(14, said) for said in opening] + [(16, said) for said in lifting] + [(-1, "play")]
     make_dataset(root, lengths=(5,) * len(shown), shown=tuple(shown))
     windows = make_windows(root, paraphrases=True)
+    assert windows.command_tasks(["lift it"]) is None
     torch.manual_seed(0)
     said = windows.paraphrase(["open the drawer"] * 50 + ["lift the red block"] * 50 + ["lift it"] * 5)
     assert set(said[:50]) == set(opening)
     assert set(said[50:100]) == set(lifting)
     assert set(said[100:]) == {"lift it"}  # means two tasks: only sentences that mean both
     assert make_windows(root).paraphrase(["anything"]) == ["anything"]
+    windows = make_windows(root, contrastive_weight=0.1)
     together = windows.command_tasks(["pull the drawer", "lift it", "lift the red block", "play"])
     shares_a_task = together @ together.T > 0
     assert shares_a_task.tolist() == [[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
