@@ -20,7 +20,6 @@ DATA = Path("data/quickstart")
 OUT = Path("outputs/quickstart")
 CONFIG = "configs/lansar.yaml"
 UPDATES = 1500
-SENTENCES = "configs/sentences.yaml"
 TASKS = [
     "open_drawer",
     "close_drawer",
@@ -80,7 +79,6 @@ def record_and_convert() -> None:
             "--episodes=1320",
             "--validation_episodes=55",
             "--cameras=[]",
-            f"--annotations={SENTENCES}",
             "--variety=0.3",
             "--seed=0",
             "--workers=2",
@@ -100,7 +98,7 @@ def record_and_convert() -> None:
 
 
 def train(name: str, *options: str, log: Path | None = None) -> Path:
-    """Trains with the recommended configuration and a CLIP that needs no download; returns the checkpoint."""
+    """Trains with the recommended configuration; returns the checkpoint."""
     checkpoint = OUT / name / "checkpoints" / "last" / "pretrained_model"
     if not checkpoint.exists():
         shutil.rmtree(OUT / name, ignore_errors=True)  # LeRobot refuses the folder of an interrupted run
@@ -111,8 +109,6 @@ def train(name: str, *options: str, log: Path | None = None) -> Path:
             f"--config_path={CONFIG}",
             "--dataset.repo_id=lansar/quickstart",
             f"--dataset.root={DATA / 'lerobot'}",
-            "--policy.clip.model=lansar-tiny",
-            "--policy.clip.pretrained=",
             f"--output_dir={OUT / name}",
             *options,
             log=log,
@@ -132,7 +128,6 @@ def evaluate(name: str, checkpoint: Path, *options: str, log: Path | None = None
             f"--env.task={','.join(TASKS)}",
             "--env.control_mode=abs",
             "--env.cameras=[]",
-            f"--env.annotations={SENTENCES}",
             "--env.render_fps=6",
             f"--eval.n_episodes={EPISODES_PER_TASK}",
             f"--seed={EVALUATION_SEED}",

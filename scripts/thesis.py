@@ -26,7 +26,6 @@ from lerobot_lansar.report.episodes import read_lines
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
-SENTENCES = "configs/sentences.yaml"
 FRAMES_PER_CORE = 200
 """Frames that one core records in a second, without pictures (docs/benchmarks.md: 224, start-up included)."""
 SHARES = {"record": 0.2, "evaluate": 0.25}
@@ -41,8 +40,8 @@ THESIS = [
     "--config_path=configs/thesis/no_images.yaml",
     "--dataset.eval_split=0",
     "--eval_steps=0",
-    "--policy.clip.model=lansar-tiny",
-    "--policy.clip.pretrained=",
+    "--policy.clip.model=lansar-desk",
+    "--policy.clip.pretrained=v1",
 ]
 RECOMMENDED = [
     "--policy.command_in_context=true",
@@ -131,8 +130,6 @@ class Thesis:
                 f"--hours={0.02 if o.dry_run else o.hours or round(hours, 2)}",
                 "--validation_hours=0.01",
                 "--cameras=[]",
-                f"--annotations={SENTENCES}",
-                f"--validation_annotations={SENTENCES}",
                 "--variety=0.3",
                 "--seed=0",
                 f"--workers={workers}",
@@ -229,7 +226,6 @@ class Thesis:
             "--env.type=calvin",
             "--env.control_mode=abs",
             "--env.cameras=[]",
-            f"--env.annotations={SENTENCES}",
             *(["--env.steps_per_command=5"] if o.dry_run else []),
             f"--chains={2 if o.dry_run else o.chains}",
             "--eval.batch_size=20",

@@ -69,7 +69,7 @@ def test_shipped_files_are_found_by_name_from_any_folder(tmp_path):
         done = subprocess.run([command, name], cwd=tmp_path, capture_output=True, text=True, check=True)
         assert Path(done.stdout.strip()).samefile(ROOT / "configs/thesis/baseline.yaml")
     listed = subprocess.run([command], cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
-    assert {"configs/lansar", "configs/sentences", "configs/thesis/eval_perturbed_0.5_5"} <= set(listed)
+    assert {"configs/lansar", "configs/thesis/eval_perturbed_0.5_5"} <= set(listed)
 
 
 def test_an_unknown_shipped_name_is_answered_with_similar_ones():

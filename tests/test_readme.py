@@ -20,7 +20,7 @@ SIZES = {
 
 ADDED = {
     "lansar-play": "--keys=d10",  # there is no display
-    "lerobot-train --config_path": "--steps=2 --policy.clip.model=lansar-tiny --policy.clip.pretrained=",
+    "lerobot-train --config_path": "--steps=2",
     "lerobot-train --policy.type=act": "--steps=2 --batch_size=2 --num_workers=0 --policy.dim_model=32 "
     "--policy.n_heads=2 --policy.dim_feedforward=64 --policy.pretrained_backbone_weights=null",
     "lansar-eval": "--env.steps_per_command=5 --env.render_fps=2 --workers=1",

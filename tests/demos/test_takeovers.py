@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -268,3 +269,50 @@ def test_a_policy_is_stuck_when_it_is_late_still_loses_a_block_or_does_something
     opened = replace(start, drawer=start.drawer + 0.2)
     assert first("turn_on_led", [start] * 7 + [opened]) == 8
     assert first("open_drawer", [opened] * 50) is None
+
+
+@pytest.mark.slow
+def test_a_policy_is_fine_tuned_on_its_takeovers_and_other_chains(recording, lansar, tmp_path):
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_LEROBOT_HOME": str(tmp_path), "OMP_NUM_THREADS": "1"}
+
+    def run(name, *arguments):
+        command = [Path(sys.executable).parent / name, *arguments]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+        assert done.returncode == 0, done.stderr[-3000:]
+
+    record(options(tmp_path / "chains", None, mode="chains", policy=TakeoverPolicy(), env=TakeoverEnv()))
+    for name, root in (("takeovers", recording), ("chains", tmp_path / "chains")):
+        told = ["--is_intervention=true"] if name == "chains" else []
+        run("lansar-convert", f"--root={root}", "--split=training", f"--repo_id=me/{name}", "--images=none", *told)
+    repositories = "--operation.repo_ids=['me/chains','me/takeovers']"
+    run("lerobot-edit-dataset", "--operation.type=merge", "--new_repo_id=me/both", repositories)
+    run(
+        "lerobot-train",
+        f"--policy.path={lansar}",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=me/both",
+        "--batch_size=4",
+        "--steps=2",
+        "--num_workers=0",
+        "--log_freq=1",
+        "--output_dir=tuned",
+    )
+
+    from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
+
+    from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+    from lerobot_lansar.policy.windows import get_current
+
+    meta = LeRobotDatasetMetadata("me/both", root=tmp_path / "me/both")
+    tuned = LanSARPolicy.from_pretrained(tmp_path / "tuned/checkpoints/last/pretrained_model")
+    LanSARPolicy(tuned.config, dataset_meta=meta)
+    acted = [frame["is_intervention"][0] for frame in frames(recording / "training")]
+    policys = get_current().counts == 0
+    assert 0 < policys.sum() <= len(acted) - sum(acted)
+    before = LanSARPolicy.from_pretrained(lansar)
+    for name, value in before.scaler.state_dict().items():
+        assert torch.equal(tuned.scaler.state_dict()[name], value), "a fine-tuned policy keeps its scaling"
+    changed = [
+        n for n, value in before.network.state_dict().items() if not torch.equal(value, tuned.network.state_dict()[n])
+    ]
+    assert "motion_head.0.weight" in changed
