@@ -105,7 +105,7 @@ def lansar(run, dataset):
 
 def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, dataset):
     options = [*SMALL_LANSAR, *TRAINING, "--policy.finetune_clip=true", "--policy.window=4", "--policy.optimizer=muon"]
-    tuned = "out/tuned/checkpoints/last/pretrained_model"
+    tuned = "out/encoder/checkpoints/last/pretrained_model"
     run(
         "lerobot-train",
         "--policy.type=lansar",
@@ -113,7 +113,7 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
         *options,
         "--steps=2",
         "--save_freq=1",
-        "--output_dir=out/tuned",
+        "--output_dir=out/encoder",
     )
     decoded = list((work / "data/.cache/huggingface").glob("lansar_frames_pictures/*/static.npy"))
     run("lerobot-train", f"--config_path={tuned}/train_config.json", "--resume=true", "--steps=3")
@@ -125,7 +125,7 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
     assert np.abs(pictures[7] / 255 - seen).max() < 0.003
 
     before, after = (
-        load_file(work / f"out/tuned/checkpoints/00000{n}/pretrained_model/model.safetensors") for n in (1, 2)
+        load_file(work / f"out/encoder/checkpoints/00000{n}/pretrained_model/model.safetensors") for n in (1, 2)
     )
     moved = {name: (after[name] - before[name]).abs().max() for name in after if name.startswith("image_encoder")}
     moved = {name: most for name, most in moved.items() if most > 0}
@@ -140,9 +140,9 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
         "--env.task=open_drawer",
         "--eval.n_episodes=2",
         "--eval.batch_size=2",
-        "--output_dir=eval_tuned",
+        "--output_dir=eval_encoder",
     )
-    assert len(successes(work, "eval_tuned")[0]) == 2
+    assert len(successes(work, "eval_encoder")[0]) == 2
     printed = run(
         "lansar-eval",
         f"--policy.path={tuned}",

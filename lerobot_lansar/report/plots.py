@@ -115,9 +115,9 @@ def plot_told(row: dict[str, Any], salt: str) -> str:
                 axes.text(x, y, f"{100 * share:.0f}", ha="center", va="center", fontsize=6.5)
         axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
         axes.set_yticks(range(len(rows)), rows, fontsize=8)
-        axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel="done first", ylabel="told")
+        axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), xlabel="done", ylabel="told")
         axes.tick_params(length=0)
-        return _svg(figure, f"What {row['label']} did first, by what it was told")
+        return _svg(figure, f"What {row['label']} did, by what it was told")
 
 
 def plot_losses(trainings: list[dict[str, Any]], salt: str) -> str:

@@ -280,7 +280,8 @@ def test_a_policy_is_fine_tuned_on_its_takeovers_and_other_chains(recording, lan
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, done.stderr[-3000:]
 
-    record(options(tmp_path / "chains", None, mode="chains", policy=TakeoverPolicy(), env=TakeoverEnv()))
+    plain = {"patience": RecordConfig.patience, "batch_size": RecordConfig.batch_size}
+    record(options(tmp_path / "chains", None, mode="chains", policy=TakeoverPolicy(), env=TakeoverEnv(), **plain))
     for name, root in (("takeovers", recording), ("chains", tmp_path / "chains")):
         told = ["--is_intervention=true"] if name == "chains" else []
         run("lansar-convert", f"--root={root}", "--split=training", f"--repo_id=me/{name}", "--images=none", *told)

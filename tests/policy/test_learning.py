@@ -9,6 +9,7 @@ import torch
 import yaml
 
 from lerobot_lansar.calvin import COLORS, continuous_euler
+from lerobot_lansar.clip.config import ClipConfig
 
 from .conftest import CONFIGS, dataset_meta, small_config
 
@@ -96,7 +97,13 @@ def test_the_policy_learns_to_reach_for_the_block_the_command_names(tmp_path):
     record(tmp_path / "data", 30)
     torch.manual_seed(0)
     config = small_config(
-        hidden=64, context_layers=1, dropout=0.0, mlp_norm="layer", learning_rate=2e-3, window_start="mixed"
+        hidden=64,
+        context_layers=1,
+        dropout=0.0,
+        mlp_norm="layer",
+        learning_rate=2e-3,
+        window_start="mixed",
+        clip=ClipConfig("lansar-desk", "v1"),
     )
     config.input_features, config.output_features = {}, {}
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(tmp_path / "data")).train()

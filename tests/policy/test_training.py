@@ -246,6 +246,8 @@ def test_the_thesis_preset_is_the_thesis():
         "position_scale_start": 3.0,
         "position_scale_slope": 1.0,
         "yaw_scale": 1.5,
+        "finetune_clip": False,
+        "clip_learning_rate": 1e-5,
         "clip": {"model": "ViT-B-32", "pretrained": "openai"},
         # what the thesis does not have
         "command_in_context": False,

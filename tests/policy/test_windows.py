@@ -92,7 +92,7 @@ def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path, monkeypatch):
     windows.device = torch.device("cuda")
     for free in (2 * size - 1, 2 * size):  # they may take half of it
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, free))
-        windows._move_to_gpu()
+        windows.on_gpu = windows._move_to_gpu(windows.arrays, windows.embeddings)
         assert windows.on_gpu == (free == 2 * size)
         assert all(isinstance(array, torch.Tensor) == windows.on_gpu for array in windows.arrays.values())
     monkeypatch.undo()

@@ -130,7 +130,7 @@ def test_plots_name_themselves_and_take_the_pages_colours(single):
     text = single.read_text()
     plots = [attrs for tag, attrs in Elements(text).found if tag == "svg"]
     assert [plot["role"] for plot in plots] == ["img", "img", "img"]
-    assert plots[2]["aria-label"] == "What policy did first, by what it was told"
+    assert plots[2]["aria-label"] == "What policy did, by what it was told"
     assert plots[0]["aria-label"] == "Success of 1 to 5 commands in a row: policy"
     assert "currentColor" in text
     assert ">commands in a row</text>" in text, "text stays text"
