@@ -377,15 +377,12 @@ def train(options: Options) -> None:
             if step % 20 == 0:
                 bar.set_postfix({name: f"{mean:.3f}" for name, mean in means.items()})
     state = {name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()}
-    settings = {name: getattr(options, name) for name in ("steps", "batch_size", "learning_rate", "seed")}
+    made = {name: str(getattr(options, name)) for name in ("steps", "batch_size", "learning_rate", "seed")}
+    made |= {"trained_by": "scripts/train_clip.py", "moments": str(len(data))}
     partial = options.output.with_suffix(".partial")
-    save_file(state, partial, {"trained_by": "scripts/train_clip.py", "moments": str(len(data)), **_texts(settings)})
+    save_file(state, partial, made)
     partial.rename(options.output)
     print(f"{options.output}: {options.output.stat().st_size / 1e6:.1f} MB; losses {means}")
-
-
-def _texts(settings: dict[str, object]) -> dict[str, str]:
-    return {name: str(value) for name, value in settings.items()}
 
 
 CENTRES = {

@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.model import Clip
 from lerobot_lansar.envs.pictures import Pictures
+from lerobot_lansar.policy.frames import load_pictures
 
 BIN = Path(sys.executable).parent
 pytestmark = pytest.mark.slow
@@ -123,6 +124,17 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
     shown = LeRobotDataset("me/desk", root=work / "data")[7]["observation.images.static"]
     seen = clip.images.resize(shown[None])[0].permute(1, 2, 0).numpy()
     assert np.abs(pictures[7] / 255 - seen).max() < 0.003
+
+    whole = np.array(pictures)
+    partial = file.parent.with_suffix(".partial")
+    file.parent.rename(partial)
+    (partial / "progress.json").write_text("100")  # as an interrupted pass leaves it
+    for camera in ("static", "gripper"):
+        array = np.load(partial / f"{camera}.npy", mmap_mode="r+")
+        array[5], array[100:] = 7, 0
+    again = load_pictures(work / "data", clip.images.size[0], clip.images.resize)["static"]
+    assert (again[5] == 7).all(), "what was decoded stays"
+    assert np.array_equal(again[100:], whole[100:])
 
     before, after = (
         load_file(work / f"out/encoder/checkpoints/00000{n}/pretrained_model/model.safetensors") for n in (1, 2)

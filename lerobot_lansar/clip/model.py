@@ -144,7 +144,9 @@ class ImageEncoder(nn.Module):
         """
         found = self.visual(self.normalize(self.resize(images)))
         if not isinstance(found, Tensor):
-            raise ValueError("--policy.finetune_clip=true: the image encoder of this CLIP gives more than an embedding")
+            raise ValueError(
+                "this CLIP's image encoder gives more than an embedding: it cannot be trained with a policy"
+            )
         return found
 
 

@@ -11,7 +11,7 @@ from torch import nn
 from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.model import Clip, embedding_size
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
-from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
+from lerobot_lansar.policy.modeling_lansar import LanSARPolicy, embed_in_parts
 from lerobot_lansar.policy.processor_lansar import ClipStep, make_lansar_pre_post_processors
 from lerobot_lansar.policy.scheduler import LinearWarmupDecaySchedulerConfig
 from lerobot_lansar.policy.windows import get_current
@@ -357,6 +357,23 @@ def test_embeddings_made_with_other_clip_weights_are_refused(tmp_path):
         preprocess(sampled_frames(0))
     with pytest.raises(ValueError, match=r"policy was trained with other weights"):
         ClipStep("lansar-desk", "", weights_sha256="e" * 64).clip("cpu")
+
+
+def test_a_trained_image_encoder_begins_as_clips_and_gets_gradients_from_every_step():
+    clip = Clip(ClipConfig("lansar-desk", ""))
+    policy = LanSARPolicy(small_config(use_images=True, finetune_clip=True))
+    pictures = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, 84, 84, 3), dtype=np.uint8))
+    batch = {f"observation.images.{camera}": pictures for camera in ("static", "gripper")}
+    batch |= {"observation.state": torch.zeros(2, 3, 15), "valid_steps": torch.tensor([0, 1, 2, 4])}  # padded: 3, 5
+    policy.train()
+    for embedded in policy._embed_windows(batch):
+        found = embedded.flatten(0, 1)
+        torch.testing.assert_close(found[[0, 1, 2, 4]], clip.encode_images(pictures), rtol=1e-4, atol=1e-5)
+        assert not found[[3, 5]].any()
+    encoder, weight = policy.image_encoder, policy.image_encoder.visual.conv1.weight
+    (whole,) = torch.autograd.grad(encoder(pictures).square().sum(), weight)
+    (parts,) = torch.autograd.grad(embed_in_parts(encoder, pictures, size=3).square().sum(), weight)
+    torch.testing.assert_close(parts, whole, rtol=1e-3, atol=1e-4 * whole.abs().max().item())
 
 
 def test_clip_follows_the_observations_to_their_device():

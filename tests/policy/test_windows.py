@@ -104,6 +104,18 @@ def test_arrays_that_lie_on_a_gpu_give_the_same_windows(tmp_path, monkeypatch):
         assert torch.equal(found[name], value)
 
 
+def test_pictures_of_a_batch_are_those_of_its_steps_without_padding(relative):
+    windows = make_windows(relative[0])
+    numbers = np.arange(len(windows.targets), dtype=np.uint8)  # a picture's only pixel is its frame's number
+    windows.pictures = {"static": np.broadcast_to(numbers[:, None, None, None], (len(numbers), 1, 1, 3))}
+    batch = windows.batch(np.array([150, 3, 60]))
+    shown = batch["static"][:, 0, 0, 0].numpy()
+    assert batch["static"].dtype == torch.uint8
+    assert len(shown) == len(batch["valid_steps"]) < batch["state"].shape[0] * batch["state"].shape[1]
+    expected = windows.frames["state"][shown]
+    np.testing.assert_array_equal(batch["state"].flatten(0, 1)[batch["valid_steps"]].numpy(), expected)
+
+
 def test_relative_and_absolute_actions_teach_the_same(relative, absolute):
     np.testing.assert_allclose(make_windows(relative[0]).targets, make_windows(absolute[0]).targets, atol=2e-6)
     assert np.abs(make_windows(absolute[0]).targets[:, 3:6]).max() < 0.05  # the roll crosses pi, its change does not
