@@ -1,4 +1,4 @@
-"""`lansar-path`: the files that this package ships, found by name from any folder."""
+"""`lansar-path`: the files and checkpoints that this package ships, found by name from any folder."""
 
 import argparse
 import difflib
@@ -10,17 +10,26 @@ from .command import CommandError, run_command
 FOLDERS = ("configs",)
 """Folders at the repository's top that are shipped; a wheel carries them inside `lerobot_lansar`."""
 
+CHECKPOINTS = "checkpoints"
+"""The folder in `lerobot_lansar` that holds trained policies."""
+
 
 def shipped() -> dict[str, Path]:
-    """All shipped files by name, such as `configs/thesis/baseline`: the path without `.yaml`."""
+    """All shipped files and checkpoints by name.
+
+    A file's name is its path without `.yaml`, such as `configs/thesis/baseline`; a checkpoint's is that of its folder,
+    such as `checkpoints/desk-d`.
+    """
     package = Path(__file__).parent
     top = package if (package / FOLDERS[0]).is_dir() else package.parent
+    checkpoints = sorted(file.parent for file in (package / CHECKPOINTS).glob("*/config.json"))
     files = sorted(file for folder in FOLDERS for file in (top / folder).rglob("*.yaml"))
-    return {file.relative_to(top).as_posix().removesuffix(".yaml"): file for file in files}
+    named = {f"{CHECKPOINTS}/{folder.name}": folder for folder in checkpoints}
+    return named | {file.relative_to(top).as_posix().removesuffix(".yaml"): file for file in files}
 
 
 def shipped_path(name: str) -> Path:
-    """The path of one shipped file.
+    """The path of one shipped file or checkpoint.
 
     Args:
         name: One of `shipped`, with or without `.yaml`.
@@ -51,7 +60,7 @@ def run() -> None:
     """
     parser = argparse.ArgumentParser(
         prog="lansar-path",
-        description="Prints the path of a file that this package ships, for use in other commands: "
+        description="Prints the path of a file or checkpoint that this package ships, for use in other commands: "
         "lerobot-train --config_path=$(lansar-path configs/thesis/baseline)",
     )
     parser.add_argument("name", nargs="?", help="such as configs/lansar; without it, all names are listed")

@@ -69,7 +69,8 @@ def test_shipped_files_are_found_by_name_from_any_folder(tmp_path):
         done = subprocess.run([command, name], cwd=tmp_path, capture_output=True, text=True, check=True)
         assert Path(done.stdout.strip()).samefile(ROOT / "configs/thesis/baseline.yaml")
     listed = subprocess.run([command], cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
-    assert {"configs/lansar", "configs/thesis/eval_perturbed_0.5_5"} <= set(listed)
+    expected = {"checkpoints/desk-d", "configs/lansar", "configs/thesis/eval_perturbed_0.5_5"}
+    assert expected <= set(listed)
 
 
 def test_an_unknown_shipped_name_is_answered_with_similar_ones():
@@ -88,8 +89,11 @@ def test_a_wheel_carries_what_lansar_path_finds_and_finds_it_there(tmp_path, mon
     (tmp_path / "lerobot_lansar/configs/thesis").mkdir(parents=True)
     file = tmp_path / "lerobot_lansar/configs/thesis/mine.yaml"
     file.touch()
+    checkpoint = tmp_path / "lerobot_lansar/checkpoints/mine"
+    checkpoint.mkdir(parents=True)
+    (checkpoint / "config.json").touch()
     monkeypatch.setattr(paths, "__file__", str(tmp_path / "lerobot_lansar/paths.py"))
-    assert paths.shipped() == {"configs/thesis/mine": file}
+    assert paths.shipped() == {"configs/thesis/mine": file, "checkpoints/mine": checkpoint}
 
 
 def test_the_readmes_links_exist_and_a_release_makes_them_absolute():
