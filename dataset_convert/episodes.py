@@ -13,9 +13,6 @@ DEDUP = ("none", "task", "frames")
 MAX_FRAMES = 54_000
 """Half an hour: beyond it LeRobot's float32 times no longer find a video's frame to within 0.1 ms."""
 
-NO_COMMAND = "play without a command"
-"""The sentence of a frame of play that no annotated window covers."""
-
 
 @dataclass(frozen=True)
 class Span:

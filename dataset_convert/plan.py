@@ -10,7 +10,6 @@ import numpy as np
 from dataset_convert import blocks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import (
-    NO_COMMAND,
     Span,
     as_ranges,
     missing_frames,
@@ -25,6 +24,7 @@ from dataset_convert.poses import describe_cameras
 from dataset_convert.shards import Job, cut_into_shards, describe, staging_of
 from dataset_convert.shared import ValidationStates, find_shared
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
+from lerobot_lansar.datasets import NO_COMMAND
 
 FRAMES_PER_SHARD = 8000
 """Frames in one parquet file, and in one mp4 per camera (about 30 MB)."""

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from dataset_convert import blocks, checks
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.episodes import NO_COMMAND, Span, window_of_frames
+from dataset_convert.episodes import Span, window_of_frames
 from dataset_convert.frames import INTERVENTION, STATES, VECTORS, digest
 from dataset_convert.layout import Layout
 from dataset_convert.poses import pose_columns
@@ -20,7 +20,7 @@ from dataset_convert.shared import ValidationStates, key_of
 from dataset_convert.writer import FrameBatch, ShardPosition, Written, write_shard
 from lerobot_lansar.calvin import TASKS, continuous_euler
 from lerobot_lansar.clip.store import sha256
-from lerobot_lansar.datasets import INTERVENTION_FEATURE, IS_INTERVENTION
+from lerobot_lansar.datasets import INTERVENTION_FEATURE, IS_INTERVENTION, NO_COMMAND
 from lerobot_lansar.jobs.staging import write_atomically
 
 DATASET, SHARDS = "dataset", "shards"

@@ -12,14 +12,14 @@ from tqdm import tqdm
 
 from dataset_convert import blocks
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.episodes import NO_COMMAND, Span, as_ranges, play_spans, window_of_frames, window_spans
+from dataset_convert.episodes import Span, as_ranges, play_spans, window_of_frames, window_spans
 from dataset_convert.frames import DEPTH, RGB, TACTILE, records_interventions, shape_of
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name, read_embeddings
 from dataset_convert.layout import check_format
 from dataset_convert.verify_shared import ValidationFrames
 from lerobot_lansar.calvin import CAMERAS, CONTROL_HZ, SCENE_NAMES, TASKS
 from lerobot_lansar.clip.store import dataset_fingerprint, sha256
-from lerobot_lansar.datasets import INTERVENTION_FEATURE, MANIFEST
+from lerobot_lansar.datasets import INTERVENTION_FEATURE, MANIFEST, NO_COMMAND
 
 
 class Mismatch(Exception):

@@ -11,6 +11,9 @@ LeRobot's name for it (`TeleopEvents.IS_INTERVENTION`)."""
 INTERVENTION_FEATURE = f"complementary_info.{IS_INTERVENTION}"
 """The dataset's column of it, named as LeRobot names the complementary information of a transition."""
 
+NO_COMMAND = "play without a command"
+"""The sentence of a frame of play that no annotated window covers."""
+
 MANIFEST = "meta/calvin_source.json"
 """File in which `lansar-convert` says what a dataset was made from."""
 

@@ -25,6 +25,7 @@ FLOORS = [
         "lerobot_lansar.desk",
         "lerobot_lansar.policy",
         "lerobot_lansar.act_depth",
+        "lerobot_lansar.peers",
         "lerobot_lansar.report",
         "dataset_convert",
     ),

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..calvin import ANGLE_UNIT, CONTROL_MODES, GRIPPER_ACTION, POSITION_UNIT, TCP_POSE
+from ..clip.commands import CLIP_COMMAND
 from ..clip.model import Clip, ImageEncoder
 from ..clip.store import IMAGE_FEATURES
 from .card import card_text
@@ -24,7 +25,7 @@ from .configuration_lansar import LanSARConfig
 from .losses import Losses
 from .network import LanSARNetwork
 from .optimizer import parameter_groups
-from .processor_lansar import CLIP_COMMAND, CLIP_IMAGE, COMMAND_TASKS, COUNTS, START, VALID_STEPS, picture_of
+from .processor_lansar import CLIP_IMAGE, COMMAND_TASKS, COUNTS, START, VALID_STEPS, picture_of
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, Scaler
 from .windows import Windows, set_current
 

@@ -32,8 +32,6 @@ and in training only:
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-from lerobot.configs.types import PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
     EnvTransition,
     PolicyProcessorPipeline,
@@ -45,21 +43,17 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from ..clip.config import ClipConfig
-from ..clip.model import Clip, weights_are_public
+from ..clip.commands import CommandStep, Features
 from ..clip.store import IMAGE_FEATURES
 from .configuration_lansar import LanSARConfig
 from .windows import Windows, get_current
 
-CLIP_COMMAND = "observation.clip.command"
 CLIP_IMAGE = {"static": "observation.clip.static", "gripper": "observation.clip.gripper"}
 
 VALID_STEPS = "valid_steps"
 START = "start_environment_state"
 COUNTS = "counts"
 COMMAND_TASKS = "command_tasks"
-
-Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
 @ProcessorStepRegistry.register("lansar_windows")
@@ -128,88 +122,31 @@ def picture_of(observation: dict[str, Any], key: str) -> Tensor:
 
 @ProcessorStepRegistry.register("lansar_clip")
 @dataclass
-class ClipStep(ProcessorStep):
+class ClipStep(CommandStep):
     """Adds the CLIP embeddings of commands and pictures, unless the batch has those of its pictures already.
 
-    The checkpoint stores weights that cannot be downloaded by name (from a local file, or random) with this step.
-
     Attributes:
-        model, pretrained: See `ClipConfig`.
         use_images: Whether the policy reads pictures' embeddings.
-        weights_sha256: Hash of the CLIP that the policy was trained with; "" before training.
     """
 
-    model: str
-    pretrained: str
     use_images: bool = True
-    weights_sha256: str = ""
-    _clip: Clip | None = field(default=None, init=False, repr=False)
-    _weights: dict[str, Tensor] | None = field(default=None, init=False, repr=False)
-    _commands: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     _windows: Windows | None = field(default_factory=get_current, init=False, repr=False)
 
-    def clip(self, device: torch.device | str | None = None) -> Clip:
-        """The CLIP, built at first use and moved to `device` if one is given.
-
-        Raises:
-            ValueError: The policy or the dataset's embeddings were made with another CLIP.
-        """
-        if self._clip is None:
-            clip = Clip(ClipConfig(self.model, self.pretrained), device or "cpu", self._weights)
-            made_with = {"policy was trained": self.weights_sha256}
-            if self._windows is not None and self._windows.clip_info:
-                made_with["dataset's pictures were embedded"] = self._windows.clip_info["weights_sha256"]
-            for what, expected in made_with.items():
-                if expected and expected != clip.weights_sha256:
-                    raise ValueError(
-                        f"The {what} with other weights of CLIP {self.model} (sha256 {expected[:12]}...) "
-                        f"than pretrained={self.pretrained!r} has now (sha256 {clip.weights_sha256[:12]}...). "
-                        "Convert the dataset again, or train a new policy with --policy.clip.pretrained as it was then."
-                    )
-            self._clip, self.weights_sha256, self._weights = clip, clip.weights_sha256, None
-        if device is not None and self._clip.device != torch.device(device):
-            self._clip.to(device)
-            self._commands.clear()
-        return self._clip
+    def _made_with(self) -> dict[str, str]:
+        info = self._windows.clip_info if self._windows is not None else {}
+        return super()._made_with() | {"dataset's pictures were embedded": info.get("weights_sha256", "")}
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        observation = dict(transition.get(TransitionKey.OBSERVATION) or {})
-        commands = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
-        if not commands:
-            raise ValueError("LanSAR needs a command: neither the dataset nor the environment gave a `task`.")
-        clip = self.clip(observation[OBS_STATE].device)
-        for sentence in set(commands) - self._commands.keys():
-            # One at a time, so that the stored embedding does not depend on the rest of the batch.
-            self._commands[sentence] = clip.encode_texts([sentence])[0]
-        observation[CLIP_COMMAND] = torch.stack([self._commands[sentence] for sentence in commands])
+        new = super().__call__(transition)
+        observation = new[TransitionKey.OBSERVATION]
         if self.use_images:
             for name, key in CLIP_IMAGE.items():
                 if key not in observation:
-                    observation[key] = clip.encode_images(picture_of(observation, IMAGE_FEATURES[name]))
-        new = transition.copy()
-        new[TransitionKey.OBSERVATION] = observation
+                    observation[key] = self.clip().encode_images(picture_of(observation, IMAGE_FEATURES[name]))
         return new
 
     def get_config(self) -> dict[str, Any]:
-        sha256 = self.clip().weights_sha256
-        return {
-            "model": self.model,
-            "pretrained": self.pretrained,
-            "use_images": self.use_images,
-            "weights_sha256": sha256,
-        }
-
-    def state_dict(self) -> dict[str, Tensor]:
-        if weights_are_public(ClipConfig(self.model, self.pretrained)):
-            return {}
-        weights = self.clip().model.state_dict()
-        return {name: value.detach().cpu().contiguous().clone() for name, value in weights.items()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self._weights, self._clip = dict(state), None
-
-    def transform_features(self, features: Features) -> Features:
-        return features
+        return super().get_config() | {"use_images": self.use_images}
 
 
 def make_lansar_pre_post_processors(
@@ -225,7 +162,8 @@ def make_lansar_pre_post_processors(
         Preprocessor and postprocessor.
     """
     steps = make_default_policy_processor_steps(config, dataset_stats)
-    clip = ClipStep(config.clip.model, config.clip.pretrained, config.use_images and not config.finetune_clip)
+    reads_embeddings = config.use_images and not config.finetune_clip
+    clip = ClipStep(config.clip.model, config.clip.pretrained, use_images=reads_embeddings)
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,

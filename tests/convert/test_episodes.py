@@ -11,13 +11,14 @@ from fake_calvin import COMMANDS, without_jumps, write_calvin
 
 from dataset_convert import blocks, convert, episodes, plan
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.episodes import NO_COMMAND, window_spans
+from dataset_convert.episodes import window_spans
 from dataset_convert.language import Window
 from dataset_convert.layout import Picture
 from dataset_convert.options import ConvertConfig
 from dataset_convert.shards import cut_into_shards
 from dataset_convert.stats import EpisodeStats
 from lerobot_lansar.calvin import SCENE_NAMES, TASKS
+from lerobot_lansar.datasets import NO_COMMAND
 
 
 def options(calvin, output_dir, **changes):

@@ -1,0 +1,145 @@
+"""`--policy.type=gr1`: GR-1's options."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
+
+from ...clip.config import ClipConfig
+from ...clip.model import embedding_size
+from ..inputs import check_features
+from .network import NetworkConfig
+
+
+@PreTrainedConfig.register_subclass("gr1")
+@dataclass
+class GR1Config(PreTrainedConfig):
+    """GR-1 (Wu et al. 2024), as published; docs/peers.md says where each value comes from."""
+
+    # Steps of history, in training and at inference.
+    window: int = 10
+    # Hidden size, layers, attention heads and dropout of the causal transformer.
+    hidden: int = 384
+    layers: int = 12
+    heads: int = 12
+    dropout: float = 0.1
+
+    # A vision transformer of timm with a class token, and the pictures' size (pixels).
+    image_encoder: str = "vit_base_patch16_224"
+    image_size: int = 224
+    # Its weights, which stay as they are: a file in timm's format, or MAE's mae_pretrain_vit_base.pth. Empty: random
+    # weights, which are trained.
+    image_encoder_weights: str = ""
+    # Tokens that a picture's patches become, and how: layers, attention heads and their size.
+    patch_tokens: int = 9
+    resampler_layers: int = 3
+    resampler_heads: int = 4
+    resampler_head_size: int = 128
+    # Layers and attention heads of what draws later pictures.
+    picture_layers: int = 2
+    picture_heads: int = 16
+
+    # The picture so many steps later is predicted, with this weight for each camera; 0: none.
+    later: int = 3
+    picture_weight: float = 0.1
+    # Weight of the gripper's loss; the arm's is 1.
+    gripper_weight: float = 0.01
+    # In training, pictures are moved by up to so many pixels in each direction, all of a window alike.
+    static_shift: int = 10
+    gripper_shift: int = 4
+
+    # Only the prediction of pictures is learned, from one camera and the command: any LeRobotDataset with pictures
+    # serves. A policy is then made of it with --policy.path=... --policy.video_only=false.
+    video_only: bool = False
+    # The camera to learn from with video_only, such as observation.images.top; empty: the dataset's first.
+    video_camera: str = ""
+
+    # The dataset's actions, and the environment's. Checked against both where they say so.
+    control_mode: str = "rel"
+
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+    # Updates in which the learning rate rises, and those after which it has fallen to a hundredth.
+    warmup_steps: int = 1000
+    decay_steps: int = 20_000
+
+    # Which CLIP embeds the commands.
+    clip: ClipConfig = field(default_factory=ClipConfig)
+
+    push_to_hub: bool = False
+    tags: list[str] | None = field(default_factory=lambda: ["calvin", "lerobot_policy_lansar"])
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.hidden % self.heads or self.hidden % self.picture_heads or self.hidden % 4:
+            raise ValueError(
+                f"--policy.heads={self.heads}, --policy.picture_heads={self.picture_heads} and 4 must divide "
+                f"--policy.hidden={self.hidden}."
+            )
+        if self.later < 1 or self.window < 1:
+            raise ValueError(f"--policy.later={self.later} and --policy.window={self.window} must be at least 1.")
+        if self.video_only and not self.picture_weight:
+            raise ValueError("--policy.video_only=true needs a --policy.picture_weight above 0.")
+        if self.control_mode != "rel":
+            raise ValueError(f"--policy.control_mode={self.control_mode!r}: GR-1's actions are relative, 'rel'.")
+
+    @property
+    def network(self) -> NetworkConfig:
+        """What the network needs of these options."""
+        return NetworkConfig(
+            image_encoder=self.image_encoder,
+            image_size=self.image_size,
+            command_features=embedding_size(self.clip.model),
+            hidden=self.hidden,
+            layers=self.layers,
+            heads=self.heads,
+            dropout=self.dropout,
+            window=self.window,
+            patch_tokens=self.patch_tokens,
+            resampler_layers=self.resampler_layers,
+            resampler_heads=self.resampler_heads,
+            resampler_head_size=self.resampler_head_size,
+            picture_layers=self.picture_layers,
+            picture_heads=self.picture_heads,
+        )
+
+    def validate_features(self) -> None:
+        """Checks the features that LeRobot found in the dataset or environment, and leaves out those it does not read.
+
+        Raises:
+            ValueError: Features are missing or have the wrong shape; the message names each.
+        """
+        if not self.video_only:
+            check_features(self)
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(lr=self.learning_rate, weight_decay=self.weight_decay, grad_clip_norm=1.0)
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=self.warmup_steps,
+            num_decay_steps=self.decay_steps,
+            peak_lr=self.learning_rate,
+            decay_lr=self.learning_rate / 100,
+        )
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        return list(range(self.window + (self.later if self.picture_weight else 0)))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.window))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
