@@ -65,7 +65,8 @@ class CommandStep(ProcessorStep):
         commands = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("task")
         if not commands:
             raise ValueError("This policy needs a command: neither the dataset nor the environment gave a `task`.")
-        clip = self.clip(next(value.device for value in observation.values() if isinstance(value, Tensor)))
+        devices = [value.device for value in observation.values() if isinstance(value, Tensor)]
+        clip = self.clip(devices[0] if devices else None)
         for sentence in set(commands) - self._commands.keys():
             # One at a time, so that the stored embedding does not depend on the rest of the batch.
             self._commands[sentence] = clip.encode_texts([sentence])[0]

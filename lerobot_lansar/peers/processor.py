@@ -2,22 +2,19 @@
 
 from typing import Any
 
-from lerobot.configs.policies import PreTrainedConfig
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 from ..clip.commands import CommandStep
-from ..clip.config import ClipConfig
 
 Pipelines = tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]
 
 
-def make_pipelines(config: PreTrainedConfig, clip: ClipConfig, dataset_stats: dict[str, Any] | None) -> Pipelines:
+def make_pipelines(config: Any, dataset_stats: dict[str, Any] | None) -> Pipelines:
     """Preprocessor and postprocessor of a new policy that reads commands.
 
     Args:
-        config: The policy's options.
-        clip: Which CLIP embeds the commands.
+        config: The policy's options, with `clip`, which embeds the commands.
         dataset_stats: LeRobot's statistics, for the normaliser.
     """
     steps = make_default_policy_processor_steps(config, dataset_stats)
@@ -26,7 +23,7 @@ def make_pipelines(config: PreTrainedConfig, clip: ClipConfig, dataset_stats: di
             steps.rename_observations,
             steps.add_batch_dim,
             steps.to_device,
-            CommandStep(clip.model, clip.pretrained),
+            CommandStep(config.clip.model, config.clip.pretrained),
             steps.normalize,
         ],
         output_steps=[steps.unnormalize, steps.to_cpu],

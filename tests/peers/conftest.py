@@ -1,6 +1,5 @@
 """A hand-made LeRobotDataset with pictures, and small MCILs, HULCs and GR-1s."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import torch
 
 from lerobot_lansar.calvin import ACTION_NAMES
 
-os.environ.setdefault("HF_HUB_OFFLINE", "1")
 torch.set_num_threads(1)
 
 SIZE = 40  # pixels, both cameras
@@ -76,8 +74,13 @@ def demonstration(rng: np.random.Generator, color: str) -> dict[str, np.ndarray]
     return {"state": state, "abs": absolute, "rel": relative.astype(np.float32), "pictures": pictures}
 
 
-def make_dataset(root: Path, form: str, count: int, unlabelled: int = 0) -> None:
-    """Writes `count` demonstrations with commands and `unlabelled` without, as one LeRobotDataset."""
+def make_dataset(
+    root: Path, form: str, count: int, unlabelled: int = 0, sentences: list[str] | None = None, camera: str = "static"
+) -> None:
+    """Writes `count` demonstrations with commands and `unlabelled` without, as one LeRobotDataset.
+
+    With `sentences`, each frame of a demonstration has its own; `camera` is the static camera's name.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_lansar.datasets import NO_COMMAND
@@ -87,7 +90,7 @@ def make_dataset(root: Path, form: str, count: int, unlabelled: int = 0) -> None
         "observation.state": {"dtype": "float32", "shape": (15,), "names": None},
         "observation.environment_state": {"dtype": "float32", "shape": (24,), "names": None},
         "action": {"dtype": "float32", "shape": (7,), "names": ACTION_NAMES[form]},
-        "observation.images.static": picture,
+        f"observation.images.{camera}": picture,
         "observation.images.gripper": picture,
     }
     dataset = LeRobotDataset.create("test/squares", fps=30, features=features, root=root, use_videos=False)
@@ -100,9 +103,9 @@ def make_dataset(root: Path, form: str, count: int, unlabelled: int = 0) -> None
                 "observation.state": shown["state"][t],
                 "observation.environment_state": np.zeros(24, np.float32),
                 "action": shown[form][t],
-                "observation.images.static": shown["pictures"][t],
+                f"observation.images.{camera}": shown["pictures"][t],
                 "observation.images.gripper": shown["pictures"][t],
-                "task": f"lift the {color} block" if i < count else NO_COMMAND,
+                "task": sentences[t] if sentences else f"lift the {color} block" if i < count else NO_COMMAND,
             }
             dataset.add_frame(frame)
         dataset.save_episode()
@@ -118,8 +121,8 @@ def datasets(tmp_path_factory):
     return {form: folder / form for form in ("rel", "abs")}
 
 
-def make(kind: str, **options):
-    """A small policy and its pipelines, for datasets of its actions' form; statistics as if all numbers lay in ±1."""
+def make(kind: str, dataset_meta=None, **options):
+    """A small policy and its pipelines; statistics as if all poses lay in ±4."""
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
@@ -140,7 +143,7 @@ def make(kind: str, **options):
         **options,
     )
     torch.manual_seed(0)
-    policy = get_policy_class(kind)(config)
+    policy = get_policy_class(kind)(config, dataset_meta=dataset_meta)
     stats = {"action": {"min": np.full(7, -4.0, np.float32), "max": np.full(7, 4.0, np.float32)}}
     stats["action"]["min"][6], stats["action"]["max"][6] = -1, 1
     return policy, *make_pre_post_processors(config, dataset_stats=stats)

@@ -17,11 +17,7 @@ for module, arguments in json.loads(sys.argv[1]):
     sys.argv = [module, *arguments]
     importlib.import_module(module).main()
 """
-TRAIN, EVAL, CHAINS = (
-    "lerobot.scripts.lerobot_train",
-    "lerobot.scripts.lerobot_eval",
-    "lerobot_lansar.evaluation.evaluate",
-)
+TRAIN, EVAL = "lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval"
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +64,7 @@ def test_it_trains_resumes_fine_tunes_and_evaluates(kind, tmp_path):
         ],
         tmp_path,
     )
-    assert printed.count("loss:") >= 8
+    assert printed.count(" loss:") == 6, "a line for each of six updates"
     weights = [load_file(tmp_path / f"out/checkpoints/00000{n}/pretrained_model/model.safetensors") for n in (2, 4)]
     assert any((weights[0][name] != weights[1][name]).any() for name in weights[0])
     config = json.loads((checkpoint / "config.json").read_text())
@@ -82,11 +78,11 @@ def test_it_trains_resumes_fine_tunes_and_evaluates(kind, tmp_path):
 
 
 def test_gr1_learns_from_videos_alone_and_becomes_a_policy(tmp_path):
-    make_dataset(tmp_path / "data", "abs", 4)
+    make_dataset(tmp_path / "data", "abs", 4, camera="top")
     make_dataset(tmp_path / "desk", "rel", 4)
     quick = ["--batch_size=3", "--num_workers=0", "--log_freq=1", "--save_freq=2", "--steps=2"]
     policy = ["--policy.type=gr1", "--policy.device=cpu", "--policy.video_only=true"]
-    policy += ["--policy.video_camera=observation.images.gripper"]
+    policy += ["--policy.video_camera=observation.images.top", "--seed=1"]
     policy += [f"--policy.{name}={value}" for name, value in SMALL["gr1"].items()]
     video = [
         "--dataset.repo_id=test/video",
@@ -101,4 +97,3 @@ def test_gr1_learns_from_videos_alone_and_becomes_a_policy(tmp_path):
     after = load_file(tmp_path / "out/checkpoints/last/pretrained_model/model.safetensors")
     name = "network.picture_layers.0.mlp.fc1.weight"
     assert (before[name] - after[name]).abs().max() < 0.01, "the policy begins with what the videos taught"
-    assert not before["network.ask_action"].equal(after["network.ask_action"])

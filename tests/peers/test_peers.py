@@ -15,7 +15,7 @@ from lerobot_lansar.peers.inputs import shift
 from lerobot_lansar.peers.latent_plan.hand_frame import to_hand, to_world
 from lerobot_lansar.peers.latent_plan.mixture import LogisticMixture
 
-from .conftest import FORMS, LENGTH, SIZE, make
+from .conftest import FORMS, LENGTH, SIZE, make, make_dataset
 
 KINDS = tuple(FORMS)
 
@@ -121,6 +121,9 @@ def test_after_a_windows_end_the_hand_stays_and_sees_what_it_saw_last(datasets):
     policy, prepare, _ = make("hulc", action_frame="world")
     policy.eval()
     batch = prepare(windows("hulc", policy, datasets, [LENGTH - 9, 0]))  # 9 frames to the end, and all 16
+    for camera in ("static", "gripper"):
+        batch[f"observation.images.{camera}"] = torch.rand(2, 16, 3, SIZE, SIZE)
+    batch["action"][0, 9:] = 0.5  # whatever the dataset repeats there
     with torch.no_grad():
         left = policy._draw_lengths((~batch["action_is_pad"]).sum(dim=1))
         seen, actions = policy._see_windows(batch, left), policy._padded_actions(batch, left)
@@ -138,40 +141,63 @@ def test_after_a_windows_end_the_hand_stays_and_sees_what_it_saw_last(datasets):
 
 
 def test_frames_without_a_command_teach_only_by_their_last_picture(datasets):
-    policy, prepare, _ = make("hulc", contrastive_weight=0.0)
+    policy, prepare, _ = make("hulc")
     batch = prepare(windows("hulc", policy, datasets, [0, LENGTH]))
+
+    def learned():
+        loss, terms = policy.forward(batch)
+        policy.zero_grad()
+        loss.backward()
+        goals = {name: getattr(policy.network, f"{name}_goal") for name in ("command", "picture")}
+        assert list(terms) == [f"{g}_{t}" for g in goals if f"{g}_kl" in terms for t in ("action_loss", "kl")] + [
+            "contrastive_loss"
+        ], "every process of a training reports the same terms"
+        return {
+            name
+            for name, goal in goals.items()
+            if any(weight.grad is not None and weight.grad.abs().max() > 0 for weight in goal.parameters())
+        }
+
     batch["task"] = [NO_COMMAND, NO_COMMAND]
-    assert {name.partition("_")[0] for name in policy.forward(batch)[1]} == {"picture"}
-    loss, _ = policy.forward(batch)
-    loss.backward()
-    assert all(weight.grad is None for weight in policy.network.command_goal.parameters())
+    assert learned() == {"picture"}
     batch["task"][1] = "lift the red block"
-    assert {name.partition("_")[0] for name in policy.forward(batch)[1]} == {"picture", "command"}
+    assert learned() == {"picture", "command"}
     policy.config.picture_goals = False
-    assert {name.partition("_")[0] for name in policy.forward(batch)[1]} == {"command"}
+    assert learned() == {"command"}
     batch["task"][1] = NO_COMMAND
-    with pytest.raises(ValueError, match="nothing to learn"):
-        policy.forward(batch)
+    assert learned() == set()
 
 
 def test_only_windows_that_end_a_demonstration_are_contrasted_with_their_commands(datasets):
     policy, prepare, _ = make("hulc", contrastive_starts=2)
-    terms = {}
-    for start in (0, LENGTH - 10, LENGTH - 9):  # the last needs at most 8 + 2 - 1 frames
+    found = {}
+    for start in (0, LENGTH - 10, LENGTH - 9):  # with 8 frames at least, a window can begin 8 or 9 before the end
         batch = prepare(windows("hulc", policy, datasets, [start, LENGTH + start]))
-        terms[start] = policy.forward(batch)[1]
-    assert ["contrastive_loss" in found for found in terms.values()] == [False, False, True]
+        found[start] = policy.forward(batch)[1]["contrastive_loss"]
+    assert [loss > 0 for loss in found.values()] == [False, False, True]
+
+
+def test_in_play_a_window_of_a_command_ends_with_it(tmp_path):
+    sentences = [NO_COMMAND] * 10 + ["lift the red block"] * 12 + [NO_COMMAND] * 2
+    make_dataset(tmp_path / "play", "rel", 1, sentences=sentences)
+    meta = LeRobotDatasetMetadata("test/squares", root=tmp_path / "play")
+    policy, prepare, _ = make("hulc", dataset_meta=meta)
+    batch = prepare(windows("hulc", policy, {"rel": tmp_path / "play"}, [0, 10, 14, 15]))
+    left, told, command_left = policy._frames_left(batch)
+    assert left.tolist() == [16, 14, 10, 9]
+    assert told.tolist() == [False, True, True, False]  # the last is told something, but for 7 frames only
+    assert command_left[1:3].tolist() == [12, 8]
+    assert policy.forward(batch)[1]["contrastive_loss"] > 0
 
 
 @pytest.mark.parametrize("kind", ["mcil", "hulc"])
 def test_a_plan_lasts_until_it_is_old_or_the_command_changes(kind):
     policy, prepare, _ = make(kind)
-    plans, memories = [], []
+    plans = []
     for step in range(8):
         commands = ["lift the red block", "lift the blue block" if step < 3 else "push the blue block"]
         policy.select_action(prepare(observation(*commands, seed=step)))
         plans.append(policy._rollout.plan.clone())
-        memories.append(policy._rollout.memory.clone())
     new = [[not torch.equal(plans[t][env], plans[t - 1][env]) for env in (0, 1)] for t in range(1, 8)]
     assert [row[0] for row in new] == [False, False, False, False, True, False, False]  # replan_steps is 5
     assert [row[1] for row in new] == [False, False, True, False, False, False, False]
@@ -182,7 +208,7 @@ def test_a_plan_lasts_until_it_is_old_or_the_command_changes(kind):
 def test_pictures_of_a_window_are_moved_alike():
     torch.manual_seed(0)
     pictures = torch.rand(1, 3, 9, 9).expand(12, -1, -1, -1)
-    moved = shift(pictures, 2, alike=4)
+    moved = shift(pictures, 2, group=4)
     assert all(torch.equal(moved[4 * k], moved[4 * k + 3]) for k in range(3))
     assert not torch.equal(moved[0], moved[4])
     corner = pictures[0, :, 2:7, 2:7]  # within 2 pixels of the middle in all of them
@@ -222,7 +248,7 @@ def test_what_gr1_is_asked_changes_no_other_answer(datasets):
     seen = Seen(network.read_command(batch["observation.clip.command"]), tokens)
     with torch.no_grad():
         alone, every = network(seen, ("action",)), network(seen, ("gripper", "action", "static"))
-        later = Seen(seen.command, torch.cat([tokens[:, :3], tokens[:, 3:] + 1], dim=1))
+        later = Seen(seen.command, torch.cat([tokens[:, :3], torch.randn_like(tokens[:, 3:])], dim=1))
         changed = network(later, ("action",))
     assert torch.allclose(alone["action"], every["action"], atol=1e-5)
     assert torch.allclose(alone["action"][:, :3], changed["action"][:, :3], atol=1e-5)
@@ -233,6 +259,7 @@ def test_gr1_learns_nothing_from_beyond_a_demonstration(datasets):
     policy, prepare, _ = make("gr1", static_shift=0, gripper_shift=0, dropout=0.0)
     batch = prepare(windows("gr1", policy, datasets, [LENGTH - 4]))
     before = policy.forward(batch)[1]
+    assert list(before) == ["arm_loss", "gripper_loss", "static_picture_loss", "gripper_picture_loss"]
     batch["action"][:, 4:] = 5
     for camera in ("static", "gripper"):
         batch[f"observation.images.{camera}"][:, 4:] = 0.5
@@ -283,6 +310,7 @@ def test_unusable_features_actions_and_environments_are_refused(kind, datasets):
     config.input_features["observation.environment_state"] = PolicyFeature(FeatureType.ENV, (24,))
     config.validate_features()
     assert "observation.environment_state" not in config.input_features, "the peers read no privileged state"
+    assert ("observation.state" in config.input_features) == (kind != "mcil")
     del config.input_features["observation.images.static"]
     with pytest.raises(ValueError, match=r"observation\.images\.static is missing"):
         config.validate_features()
@@ -297,6 +325,8 @@ def test_unusable_features_actions_and_environments_are_refused(kind, datasets):
         ("hulc", {"recognition_heads": 5}, "--policy.recognition_heads=5"),
         ("mcil", {"action_frame": "hand"}, "--policy.control_mode=rel"),
         ("gr1", {"heads": 7}, "--policy.heads=7"),
+        ("gr1", {"image_size": 40}, "--policy.image_size=40"),
+        ("gr1", {"window": 1}, "--policy.window=1"),
         ("gr1", {"control_mode": "abs"}, "--policy.control_mode='abs'"),
     ],
 )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.configs.types import NormalizationMode
+from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 
@@ -20,34 +20,44 @@ class GR1Config(PreTrainedConfig):
 
     # Steps of history, in training and at inference.
     window: int = 10
-    # Hidden size, layers, attention heads and dropout of the causal transformer.
+    # Hidden size of the causal transformer; both numbers of attention heads must divide it.
     hidden: int = 384
+    # Layers of the causal transformer.
     layers: int = 12
+    # Attention heads of the causal transformer.
     heads: int = 12
+    # Dropout of the causal transformer.
     dropout: float = 0.1
 
-    # A vision transformer of timm with a class token, and the pictures' size (pixels).
+    # A vision transformer of timm with a class token.
     image_encoder: str = "vit_base_patch16_224"
+    # Pictures are brought to this height and width, pixels.
     image_size: int = 224
     # Its weights, which stay as they are: a file in timm's format, or MAE's mae_pretrain_vit_base.pth. Empty: random
     # weights, which are trained.
     image_encoder_weights: str = ""
-    # Tokens that a picture's patches become, and how: layers, attention heads and their size.
+    # Tokens that a picture's patches become.
     patch_tokens: int = 9
+    # Layers of the resampler that makes them.
     resampler_layers: int = 3
+    # Attention heads of the resampler.
     resampler_heads: int = 4
+    # Size of each of these heads.
     resampler_head_size: int = 128
-    # Layers and attention heads of what draws later pictures.
+    # Layers of what draws later pictures.
     picture_layers: int = 2
+    # Attention heads of what draws later pictures.
     picture_heads: int = 16
 
-    # The picture so many steps later is predicted, with this weight for each camera; 0: none.
+    # The picture so many steps later is predicted.
     later: int = 3
+    # Weight of that prediction for each camera; 0: none.
     picture_weight: float = 0.1
     # Weight of the gripper's loss; the arm's is 1.
     gripper_weight: float = 0.01
-    # In training, pictures are moved by up to so many pixels in each direction, all of a window alike.
+    # In training, static pictures are moved by up to so many pixels in each direction, all of a window alike.
     static_shift: int = 10
+    # In training, gripper pictures are moved by up to so many pixels in each direction, all of a window alike.
     gripper_shift: int = 4
 
     # Only the prediction of pictures is learned, from one camera and the command: any LeRobotDataset with pictures
@@ -59,16 +69,21 @@ class GR1Config(PreTrainedConfig):
     # The dataset's actions, and the environment's. Checked against both where they say so.
     control_mode: str = "rel"
 
+    # Peak learning rate.
     learning_rate: float = 1e-3
+    # Weight decay.
     weight_decay: float = 0.0
-    # Updates in which the learning rate rises, and those after which it has fallen to a hundredth.
+    # Updates in which the learning rate rises.
     warmup_steps: int = 1000
+    # Updates after which the learning rate has fallen to a hundredth.
     decay_steps: int = 20_000
 
     # Which CLIP embeds the commands.
     clip: ClipConfig = field(default_factory=ClipConfig)
 
+    # Upload the trained policy; needs --policy.repo_id=you/name.
     push_to_hub: bool = False
+    # Tags of the uploaded policy.
     tags: list[str] | None = field(default_factory=lambda: ["calvin", "lerobot_policy_lansar"])
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -85,8 +100,10 @@ class GR1Config(PreTrainedConfig):
                 f"--policy.heads={self.heads}, --policy.picture_heads={self.picture_heads} and 4 must divide "
                 f"--policy.hidden={self.hidden}."
             )
-        if self.later < 1 or self.window < 1:
-            raise ValueError(f"--policy.later={self.later} and --policy.window={self.window} must be at least 1.")
+        if self.later < 1 or self.window < 2:
+            raise ValueError(
+                f"--policy.later={self.later} must be at least 1 and --policy.window={self.window} at least 2."
+            )
         if self.video_only and not self.picture_weight:
             raise ValueError("--policy.video_only=true needs a --policy.picture_weight above 0.")
         if self.control_mode != "rel":
@@ -119,7 +136,15 @@ class GR1Config(PreTrainedConfig):
             ValueError: Features are missing or have the wrong shape; the message names each.
         """
         if not self.video_only:
-            check_features(self)
+            check_features(self, reads_state=True)
+        elif self.input_features:
+            cameras = [k for k, f in self.input_features.items() if f.type is FeatureType.VISUAL and f.shape[0] == 3]
+            self.video_camera = self.video_camera or (cameras[0] if cameras else "any camera")
+            if self.video_camera not in cameras:
+                raise ValueError(
+                    f"--policy.video_only=true finds no {self.video_camera} in the dataset; it has {cameras}."
+                )
+            self.input_features = {}  # those of the desk take their place when the policy is made
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=self.weight_decay, grad_clip_norm=1.0)
@@ -143,3 +168,8 @@ class GR1Config(PreTrainedConfig):
     @property
     def reward_delta_indices(self) -> None:
         return None
+
+    @property
+    def drop_n_last_frames(self) -> int:
+        """Frames at a recording's end from which there is nothing to learn."""
+        return self.later if self.video_only else 0

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -51,7 +51,7 @@ class GR1Policy(PreTrainedPolicy):
             check_actions(dataset_meta.features, config.control_mode)
         self.network = GR1Network(config.network)
         if config.image_encoder_weights:
-            if dataset_meta is not None and not config.pretrained_path:
+            if dataset_meta is not None and not config.pretrained_path:  # a checkpoint has its own
                 load_image_encoder(self.network.image_encoder, config.image_encoder_weights)
             self.network.image_encoder.requires_grad_(False)
         self.register_buffer("_mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
@@ -71,7 +71,7 @@ class GR1Policy(PreTrainedPolicy):
         """The loss of a batch of windows.
 
         Args:
-            batch: Preprocessed: observation.images.* (B, T + later, 3, H, W) in [0, 1] and their *_is_pad (B, T +
+            batch: Preprocessed: observation.images.* (B, T + later, 3, H, W) in [0, 1], observation.*_is_pad (B, T +
                 later), observation.clip.command (B, D); unless `video_only` also observation.state (B, T + later, 15),
                 action (B, T, 7) and action_is_pad (B, T).
 
@@ -79,7 +79,7 @@ class GR1Policy(PreTrainedPolicy):
             The loss, (); its terms.
         """
         config, steps = self.config, self.config.window
-        cameras = {"static": self._video_camera(batch)} if config.video_only else IMAGE_FEATURES
+        cameras = {"static": config.video_camera} if config.video_only else IMAGE_FEATURES
         pictures = {name: self._prepare(batch[key], name) for name, key in cameras.items()}
         tokens = [self._see(window[:, :steps], name) for name, window in pictures.items()]
         if not config.video_only:
@@ -87,41 +87,31 @@ class GR1Policy(PreTrainedPolicy):
         questions = (() if config.video_only else ("action",)) + (tuple(pictures) if config.picture_weight else ())
         command = self.network.read_command(batch[CLIP_COMMAND])
         answers = self.network(Seen(command, torch.cat(tokens, dim=2)), questions)
-        terms: dict[str, Tensor] = {}
-        weights: dict[str, float] = {}
+        losses, terms = [], {}
         if not config.video_only:
             valid, target = ~batch["action_is_pad"], batch[ACTION]
             arm, gripper = self.network.actions(answers["action"])
-            terms["arm_loss"] = F.smooth_l1_loss(arm[valid], target[..., :6][valid])
             opens = (target[..., 6][valid] > 0).float()
+            terms["arm_loss"] = F.smooth_l1_loss(arm[valid], target[..., :6][valid])
             terms["gripper_loss"] = F.binary_cross_entropy_with_logits(gripper[valid], opens)
-            weights |= {"arm_loss": 1.0, "gripper_loss": config.gripper_weight}
+            losses += [terms["arm_loss"], config.gripper_weight * terms["gripper_loss"]]
         for name in pictures if config.picture_weight else ():
-            valid = ~batch[f"{cameras[name]}_is_pad"][:, config.later :]
-            if valid.any():
-                drawn = self.network.draw(answers[name][valid])
-                terms[f"{name}_loss"] = F.mse_loss(drawn, self.network.cut(pictures[name][:, config.later :][valid]))
-                weights[f"{name}_loss"] = config.picture_weight
-        if not terms:
-            raise ValueError(
-                f"No window of this batch reaches --policy.later={config.later} frames further: nothing to learn from."
-            )
-        loss = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
-        return loss, {name: term.item() for name, term in terms.items()}
-
-    def _video_camera(self, batch: dict[str, Any]) -> str:
-        cameras = sorted(key for key in batch if key.startswith(OBS_IMAGES) and not key.endswith("_is_pad"))
-        wanted = self.config.video_camera or (cameras[0] if cameras else "any camera")
-        if wanted not in cameras:
-            raise ValueError(f"--policy.video_only=true finds no {wanted} in the dataset; it has {cameras}.")
-        return wanted
+            # LeRobot's names of these flags follow the dataset's names of the cameras; all of them are the same.
+            ended = next(v for k, v in batch.items() if k.startswith("observation.") and k.endswith("_is_pad"))
+            valid = ~ended[:, config.later :]
+            drawn = self.network.draw(answers[name][valid])
+            error = (drawn - self.network.cut(pictures[name][:, config.later :][valid])) ** 2
+            # Every process of a training reports the same terms, also where no window reaches so far.
+            terms[f"{name}_picture_loss"] = error.sum() / max(1, error.numel())
+            losses.append(config.picture_weight * terms[f"{name}_picture_loss"])
+        return torch.stack(losses).sum(), {name: term.item() for name, term in terms.items()}
 
     def _prepare(self, window: Tensor, camera: str) -> Tensor:
         """(B, T, 3, H, W) in [0, 1] -> (B, T, 3, S, S) as the image encoder reads them, in training moved."""
         by = {"static": self.config.static_shift, "gripper": self.config.gripper_shift}[camera]
         pictures = window.flatten(0, 1)
         if self.training:
-            pictures = shift(pictures, by, alike=window.shape[1])
+            pictures = shift(pictures, by, group=window.shape[1])
         pictures = resize(pictures, self.config.image_size, "bicubic")
         return ((pictures - self._mean) / self._std).unflatten(0, window.shape[:2])
 
@@ -160,14 +150,14 @@ class GR1Policy(PreTrainedPolicy):
         tokens = torch.cat([self.network.read_state(batch[OBS_STATE])[:, None, None], *seen], dim=2)
         self._remember(tokens, batch["task"])
         commands = self.network.read_command(batch[CLIP_COMMAND])
-        actions = tokens.new_empty(len(tokens), 7)
+        actions = torch.empty(len(tokens), 7, device=tokens.device)
         lengths = [len(history.tokens) for history in self._histories]
         for length in set(lengths):  # environments with histories of one length at once
             rows = [i for i, own in enumerate(lengths) if own == length]
             window = torch.stack([self._histories[i].tokens for i in rows])
             answer = self.network(Seen(commands[rows], window), ("action",))["action"]
             arm, gripper = self.network.actions(answer[:, -1:])
-            actions[rows] = torch.cat([arm[:, 0], torch.where(gripper > 0, 1.0, -1.0)], dim=1)
+            actions[rows] = torch.cat([arm[:, 0].float(), torch.where(gripper > 0, 1.0, -1.0)], dim=1)
         return actions
 
     def _remember(self, tokens: Tensor, commands: list[str]) -> None:

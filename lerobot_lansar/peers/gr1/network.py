@@ -8,10 +8,8 @@ the rest, and an evaluation asks for [ACT] only.
 
 from dataclasses import dataclass
 
-import timm
 import torch
 import torch.nn.functional as F
-from timm.models.vision_transformer import Block
 from torch import Tensor, nn
 
 CAMERAS = ("static", "gripper")
@@ -110,6 +108,9 @@ class GR1Network(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
+        import timm  # takes a second, and every command of LeRobot imports the plugin
+        from timm.models.vision_transformer import Block
+
         self.config = config
         hidden = config.hidden
         self.image_encoder = timm.create_model(
@@ -117,7 +118,12 @@ class GR1Network(nn.Module):
         )
         size = self.image_encoder.num_features
         self.patch = self.image_encoder.patch_embed.patch_size[0]
-        self.side = config.image_size // self.patch
+        self.side, rest = divmod(config.image_size, self.patch)
+        if rest:
+            raise ValueError(
+                f"--policy.image_size={config.image_size} must be a multiple of the {self.patch} pixels of a patch of "
+                f"--policy.image_encoder={config.image_encoder}."
+            )
         self.resampler = Resampler(
             config.patch_tokens,
             size,
@@ -144,6 +150,12 @@ class GR1Network(nn.Module):
         self.transformer = nn.TransformerEncoder(
             layer, config.layers, norm=nn.LayerNorm(hidden), enable_nested_tensor=False
         )
+        for layer in self.transformer.layers:  # as GPT-2 begins; torch would make all layers alike
+            for weight in layer.parameters():
+                if weight.ndim == 2:
+                    nn.init.normal_(weight, std=0.02)
+            nn.init.zeros_(layer.linear1.bias)
+            nn.init.zeros_(layer.linear2.bias)
         # Two linear layers without anything between them, as published.
         self.action_head = nn.Sequential(nn.Linear(hidden, hidden // 2), nn.Linear(hidden // 2, hidden // 2))
         self.arm_action, self.gripper_action = nn.Linear(hidden // 2, ARM), nn.Linear(hidden // 2, 1)

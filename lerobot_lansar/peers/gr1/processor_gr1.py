@@ -10,4 +10,4 @@ def make_gr1_pre_post_processors(
     config: GR1Config, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> Pipelines:
     """The pipelines of a new GR-1."""
-    return make_pipelines(config, config.clip, dataset_stats)
+    return make_pipelines(config, dataset_stats)

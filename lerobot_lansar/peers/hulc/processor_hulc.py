@@ -10,4 +10,4 @@ def make_hulc_pre_post_processors(
     config: HULCConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> Pipelines:
     """The pipelines of a new HULC."""
-    return make_pipelines(config, config.clip, dataset_stats)
+    return make_pipelines(config, dataset_stats)

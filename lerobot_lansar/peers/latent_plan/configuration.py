@@ -27,50 +27,62 @@ class LatentPlanConfig(PreTrainedConfig):
     The values here are HULC's, as published (docs/peers.md says where each comes from).
     """
 
-    # Frames in a training window at most, and at least; each is drawn between them.
+    # Frames in a training window at most; each window's are drawn between min_window and this.
     window: int = 32
+    # Frames in a training window at least.
     min_window: int = 20
-    # Pictures are brought to these sizes (pixels), and in training moved by up to so many pixels in each direction.
+    # Static pictures are brought to this height and width, pixels.
     static_size: int = 200
+    # Gripper pictures are brought to this height and width, pixels.
     gripper_size: int = 84
+    # In training, static pictures are moved by up to so many pixels in each direction.
     static_shift: int = 10
+    # In training, gripper pictures are moved by up to so many pixels in each direction.
     gripper_shift: int = 4
-    # Numbers that each camera's picture becomes, and a goal.
+    # Numbers that each camera's picture becomes.
     visual_features: int = 64
+    # Numbers that a goal becomes.
     goal_features: int = 32
     # Width of the recurrent and feed-forward layers.
     hidden: int = 2048
 
     # Plans: discrete (plan_size choices among plan_classes) or continuous (plan_size numbers).
     plan: str = "discrete"
+    # Choices, or numbers, of a plan.
     plan_size: int = 32
+    # Among how many a choice of a discrete plan is.
     plan_classes: int = 32
-    # What recognises a plan in a window: transformer or rnn (in both directions).
+    # What recognises a plan in a window: transformer, or rnn (in both directions).
     recognition: str = "transformer"
-    # The transformer's layers, attention heads, dropout, and width after it.
+    # Layers of that transformer.
     recognition_layers: int = 2
+    # Attention heads of that transformer.
     recognition_heads: int = 8
+    # Dropout of that transformer.
     recognition_dropout: float = 0.1
+    # Width after that transformer.
     recognition_features: int = 4096
 
-    # Components of the mixture that an action's number has, and bins in [-1, 1].
+    # Logistic distributions in the mixture of each of an action's numbers.
     mixtures: int = 10
+    # Bins in [-1, 1] that each of an action's numbers falls into.
     bins: int = 10
-    # The gripper has a loss of its own (closed or open) instead of a mixture, with this weight; 0: a mixture.
+    # Weight of a cross-entropy for the gripper (closed or open); 0: it is a number like the others.
     gripper_weight: float = 1.0
-    # Relative actions are learned in the frame of the hand, or of the world.
+    # Relative actions are learned in the frame of the hand (hand) or of the world (world).
     action_frame: str = "hand"
-    # What the decoder sees beside plan and goal: the gripper's picture only, or both.
+    # What the decoder sees beside plan and goal: the gripper's picture (gripper), or both.
     decoder_sees: str = "gripper"
 
-    # Weight of the divergence between proposed and recognised plans, and the share of it that moves the proposal.
+    # Weight of the divergence between proposed and recognised plans.
     kl_weight: float = 0.01
+    # Share of the divergence that moves the proposal; the rest moves the recognition.
     kl_balance: float = 0.8
-    # Weight of the contrastive loss between windows that end a demonstration and their commands; 0: none.
+    # Weight of the contrastive loss between commands and the windows in which they are fulfilled; 0: none.
     contrastive_weight: float = 3.0
-    # It takes windows that begin at most so many frames before the last possible one.
+    # It takes the windows that begin in so many last frames in which a window can begin.
     contrastive_starts: int = 8
-    # Windows are also learned with their own last picture as the goal, which needs no command. Off: commands only.
+    # Windows are also learned with their own last picture as the goal, which needs no command.
     picture_goals: bool = True
 
     # Control steps after which a rollout draws a new plan.
@@ -78,12 +90,15 @@ class LatentPlanConfig(PreTrainedConfig):
     # rel or abs: the dataset's actions, and the environment's. Checked against both where they say so.
     control_mode: str = "rel"
 
+    # Learning rate, constant.
     learning_rate: float = 2e-4
 
     # Which CLIP embeds the commands.
     clip: ClipConfig = field(default_factory=ClipConfig)
 
+    # Upload the trained policy; needs --policy.repo_id=you/name.
     push_to_hub: bool = False
+    # Tags of the uploaded policy.
     tags: list[str] | None = field(default_factory=lambda: ["calvin", "lerobot_policy_lansar"])
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -146,10 +161,10 @@ class LatentPlanConfig(PreTrainedConfig):
         Raises:
             ValueError: Features are missing or have the wrong shape; the message names each.
         """
-        check_features(self)
+        check_features(self, reads_state=self.action_frame == "hand")
 
     def get_optimizer_preset(self) -> AdamConfig:
-        return AdamConfig(lr=self.learning_rate)
+        return AdamConfig(lr=self.learning_rate, grad_clip_norm=0.0)  # 0: none, as published
 
     def get_scheduler_preset(self) -> None:
         return None

@@ -41,17 +41,19 @@ def to_hand(actions: Tensor, state: Tensor) -> Tensor:
         actions: In units of (0.02 m, 0.05 rad); the gripper's command stays.
         state: robot_obs, (..., 15).
     """
-    euler = state[..., 3:6]
-    hand = rotation(euler)
-    position = (hand.mT @ actions[..., :3, None])[..., 0]
-    turn = angles(rotation(euler + SMALL * actions[..., 3:6]).mT @ hand)
+    actions, euler = actions.float(), state[..., 3:6].float()
+    with torch.autocast(actions.device.type, enabled=False):  # a hundredth of a turn is lost in bfloat16
+        hand = rotation(euler)
+        position = (hand.mT @ actions[..., :3, None])[..., 0]
+        turn = angles(rotation(euler + SMALL * actions[..., 3:6]).mT @ hand)
     return torch.cat([position, wrap_angle(turn) / SMALL, actions[..., 6:]], dim=-1)
 
 
 def to_world(actions: Tensor, state: Tensor) -> Tensor:
     """The inverse of `to_hand`."""
-    euler = state[..., 3:6]
-    hand = rotation(euler)
-    position = (hand @ actions[..., :3, None])[..., 0]
-    turned = angles(hand @ rotation(SMALL * actions[..., 3:6]).mT)
+    actions, euler = actions.float(), state[..., 3:6].float()
+    with torch.autocast(actions.device.type, enabled=False):
+        hand = rotation(euler)
+        position = (hand @ actions[..., :3, None])[..., 0]
+        turned = angles(hand @ rotation(SMALL * actions[..., 3:6]).mT)
     return torch.cat([position, wrap_angle(turned - euler) / SMALL, actions[..., 6:]], dim=-1)

@@ -4,6 +4,7 @@ An action's number in [-1, 1] falls into one of `bins` bins; the probability of 
 its edges, and the outermost bins reach to infinity (Salimans et al. 2017, PixelCNN++).
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -39,9 +40,7 @@ class LogisticMixture:
         inside = torch.sigmoid(above) - torch.sigmoid(below)
         middle = scaled * (numbers - self.means)
         density = middle - self.log_scales - 2 * F.softplus(middle)  # where a bin's share is too small to subtract
-        log_share = torch.where(
-            inside > 1e-5, inside.clamp(min=1e-12).log(), density - torch.tensor((self.bins - 1) / 2).log()
-        )
+        log_share = torch.where(inside > 1e-5, inside.clamp(min=1e-12).log(), density - math.log((self.bins - 1) / 2))
         log_share = torch.where(numbers > 1 - AT_THE_EDGE, -F.softplus(below), log_share)
         log_share = torch.where(numbers < -1 + AT_THE_EDGE, above - F.softplus(above), log_share)
         return torch.logsumexp(log_share + F.log_softmax(self.logits, dim=-1), dim=-1).sum(dim=-1)

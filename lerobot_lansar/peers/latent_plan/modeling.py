@@ -12,14 +12,14 @@ from torch import Tensor
 from ...clip.commands import CLIP_COMMAND
 from ...clip.store import IMAGE_FEATURES
 from ...datasets import NO_COMMAND
-from ..inputs import check_actions, check_control_mode, pictures_of, resize, shift
+from ..inputs import check_actions, check_control_mode, command_ends, pictures_of, resize, shift
 from .configuration import LatentPlanConfig
 from .hand_frame import to_hand, to_world
 from .mixture import LogisticMixture
 from .network import LatentPlanNetwork
 
-SHOWN = 0.5
-"""Pictures are fed to the network as (picture - 0.5) / 0.5."""
+MEAN = STD = 0.5
+"""Pictures are fed to the network as (picture - MEAN) / STD."""
 
 
 @dataclass
@@ -45,7 +45,8 @@ class LatentPlanPolicy(PreTrainedPolicy):
 
     Args:
         config: All options.
-        dataset_meta: Given in training; its actions' names must be those of `control_mode`.
+        dataset_meta: Given in training. Its actions' names must be those of `control_mode`; its commands end where its
+            frames say.
 
     Raises:
         ValueError: The dataset or the options cannot be used; the message says why.
@@ -58,8 +59,10 @@ class LatentPlanPolicy(PreTrainedPolicy):
     def __init__(self, config: LatentPlanConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
+        self._command_ends: Tensor | None = None  # in training only
         if dataset_meta is not None:
             check_actions(dataset_meta.features, config.control_mode)
+            self._command_ends = torch.from_numpy(command_ends(dataset_meta.root))
         self.network = LatentPlanNetwork(config.network)
         self.reset()
 
@@ -76,44 +79,54 @@ class LatentPlanPolicy(PreTrainedPolicy):
         """The loss of a batch of windows.
 
         Args:
-            batch: Preprocessed: observation.images.* (B, T, 3, H, W) in [0, 1], observation.state (B, T, 15), action
-                (B, T, 7), action_is_pad (B, T), observation.clip.command (B, D), task (B sentences).
+            batch: Preprocessed: observation.images.* (B, T, 3, H, W) in [0, 1], action (B, T, 7), action_is_pad (B, T),
+                observation.clip.command (B, D), task (B sentences), index (B,); for the frame of the hand also
+                observation.state (B, T, 15).
 
         Returns:
             The loss, (); its terms.
         """
         config, network = self.config, self.network
-        left = (~batch["action_is_pad"]).sum(dim=1)  # frames to the demonstration's end, at most T
-        lengths = self._draw_lengths(left)
+        left, told, command_left = self._frames_left(batch)
+        lengths = self._draw_lengths(torch.where(told, torch.minimum(left, command_left), left))
         seen = self._see_windows(batch, lengths)
         actions = self._padded_actions(batch, lengths)
         recognition = network.recognition(seen)
         parameters = network.recognized(recognition)
-        commanded = torch.tensor([task != NO_COMMAND for task in batch["task"]], device=seen.device)
-        losses: list[Tensor] = []
-        terms: dict[str, Tensor] = {}
-        goals = {}
-        if commanded.any():
-            goals["command"] = (commanded, network.command_goal(batch[CLIP_COMMAND][commanded]))
+        goals = {"command": (told, network.command_goal(batch[CLIP_COMMAND]))}
         if config.picture_goals:
-            goals["picture"] = (torch.ones_like(commanded), network.picture_goal(seen[:, -1]))
-        if not goals:
-            raise ValueError(
-                "No frame of this batch has a command, and --policy.picture_goals=false: nothing to learn."
-            )
+            goals["picture"] = (torch.ones_like(told), network.picture_goal(seen[:, -1]))
+        # Every process of a training reports the same terms, whatever its batch holds.
+        nothing = parameters.sum() * 0
+        terms: dict[str, Tensor] = {}
+        losses: list[Tensor] = []
         for name, (rows, goal) in goals.items():
-            plan = network.draw(parameters[rows])
-            action_loss = self._action_loss(plan, seen[rows], goal, actions[rows])
-            divergence = network.divergence(network.propose(seen[rows, 0], goal), parameters[rows], config.kl_balance)
-            losses.append(action_loss + config.kl_weight * divergence)
+            action_loss = divergence = nothing
+            if rows.any():
+                plan = network.draw(parameters[rows])
+                action_loss = self._action_loss(plan, seen[rows], goal[rows], actions[rows])
+                proposed = network.propose(seen[rows, 0], goal[rows])
+                divergence = network.divergence(proposed, parameters[rows], config.kl_balance)
+                losses.append(action_loss + config.kl_weight * divergence)
             terms |= {f"{name}_action_loss": action_loss, f"{name}_kl": divergence}
-        loss = torch.stack(losses).mean()
-        ending = left[commanded] < config.min_window + config.contrastive_starts
-        if config.contrastive_weight and ending.any():
-            contrast = network.contrast(recognition[commanded][ending], goals["command"][1][ending])
+        loss = torch.stack(losses).mean() if losses else nothing
+        if config.contrastive_weight:
+            ending = told & (command_left < config.min_window + config.contrastive_starts)
+            contrast = network.contrast(recognition[ending], goals["command"][1][ending]) if ending.any() else nothing
             loss = loss + config.contrastive_weight * contrast
             terms["contrastive_loss"] = contrast
         return loss, {name: term.item() for name, term in terms.items()}
+
+    def _frames_left(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor]:
+        """What follows each window's first frame, (B,) each: frames to the recording's end, at most T; whether there is
+        a command for long enough to learn it; frames to that command's end."""
+        left = (~batch["action_is_pad"]).sum(dim=1)
+        command_left = left
+        if self._command_ends is not None:
+            index = batch["index"].flatten().cpu()
+            command_left = (self._command_ends[index] - index).to(left.device)
+        told = torch.tensor([task != NO_COMMAND for task in batch["task"]], device=left.device)
+        return left, told & (command_left >= self.config.min_window), command_left
 
     def _draw_lengths(self, left: Tensor) -> Tensor:
         """Each window's frames: random in training, as many as there are otherwise."""
@@ -136,16 +149,16 @@ class LatentPlanPolicy(PreTrainedPolicy):
         shifts = (config.static_shift, config.gripper_shift) if self.training else (0, 0)
         sizes = (config.static_size, config.gripper_size)
         shown = [
-            (shift(resize(pictures, size), by) - SHOWN) / SHOWN
+            (shift(resize(pictures, size), by) - MEAN) / STD
             for pictures, size, by in zip((static, gripper), sizes, shifts, strict=True)
         ]
         return self.network.see(*shown)
 
     def _padded_actions(self, batch: dict[str, Any], lengths: Tensor) -> Tensor:
         """Actions as they are learned, (B, T, 7): after a window's end the hand stays where it is."""
-        actions, state = batch[ACTION], batch[OBS_STATE]
+        actions = batch[ACTION]
         if self.config.action_frame == "hand":
-            actions = to_hand(actions, state)
+            actions = to_hand(actions, batch[OBS_STATE])
         steps = torch.arange(self.config.window, device=lengths.device)
         last = torch.minimum(steps, lengths[:, None] - 1)
         padded = actions.gather(1, last[..., None].expand(-1, -1, 7))
@@ -170,8 +183,8 @@ class LatentPlanPolicy(PreTrainedPolicy):
         """One random action per environment, as published.
 
         Args:
-            batch: A preprocessed observation: observation.images.* (B, 3, H, W) in [0, 1], observation.state (B, 15),
-                observation.clip.command (B, D), task (B sentences).
+            batch: A preprocessed observation: observation.images.* (B, 3, H, W) in [0, 1], observation.clip.command
+                (B, D), task (B sentences); for the frame of the hand also observation.state (B, 15).
 
         Returns:
             (B, 7), still to be postprocessed; the gripper's command is -1 or +1.
@@ -185,7 +198,7 @@ class LatentPlanPolicy(PreTrainedPolicy):
         seen = self._see(*pictures_of(batch))
         rollout = self._with_plans(seen, batch[CLIP_COMMAND], batch["task"])
         mixture, logits, rollout.memory = self.network.act(rollout.plan, seen[:, None], rollout.goal, rollout.memory)
-        return self._to_action(mixture, logits, batch[OBS_STATE])
+        return self._to_action(mixture, logits, batch.get(OBS_STATE))
 
     def _with_plans(self, seen: Tensor, commands: Tensor, sentences: list[str]) -> Rollout:
         """The rollout with a new plan wherever a command has changed or the plan is old."""
@@ -208,10 +221,11 @@ class LatentPlanPolicy(PreTrainedPolicy):
             rollout.memory[:, new] = 0
         return rollout
 
-    def _to_action(self, mixture: LogisticMixture, logits: Tensor | None, state: Tensor) -> Tensor:
+    def _to_action(self, mixture: LogisticMixture, logits: Tensor | None, state: Tensor | None) -> Tensor:
         numbers = mixture.sample()[:, 0]
         gripper = numbers[:, 6] if logits is None else logits[:, 0, 1] - logits[:, 0, 0]
         action = torch.cat([numbers[:, :6], torch.where(gripper > 0, 1.0, -1.0)[:, None]], dim=1)
         if self.config.action_frame == "hand":
+            assert state is not None
             action = to_world(action, state)
         return action

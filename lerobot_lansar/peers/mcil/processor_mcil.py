@@ -10,4 +10,4 @@ def make_mcil_pre_post_processors(
     config: MCILConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> Pipelines:
     """The pipelines of a new MCIL."""
-    return make_pipelines(config, config.clip, dataset_stats)
+    return make_pipelines(config, dataset_stats)
