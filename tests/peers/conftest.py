@@ -53,7 +53,10 @@ FORMS = {"mcil": "abs", "hulc": "rel", "gr1": "rel"}
 
 
 def demonstration(rng: np.random.Generator, color: str) -> dict[str, np.ndarray]:
-    """The hand goes to the square of one colour, closing when it is there; pictures show both squares and the hand."""
+    """The hand goes to the square of one colour, closing when it is there.
+
+    Pictures show both squares and, black, the hand; the ground has another colour in each demonstration.
+    """
     places = {name: rng.uniform(-0.15, 0.15, 2) for name in COLORS}
     state = np.zeros((LENGTH, 15), np.float32)
     state[0, :6] = [*rng.uniform(-0.15, 0.15, 2), 0.5, np.pi, 0, 1.5]
@@ -66,11 +69,11 @@ def demonstration(rng: np.random.Generator, color: str) -> dict[str, np.ndarray]
         if t + 1 < LENGTH:
             state[t + 1, :6], state[t + 1, 14] = absolute[t, :6], absolute[t, 6]
     relative = np.concatenate([(absolute[:, :6] - state[:, :6]) / ([0.02] * 3 + [0.05] * 3), absolute[:, 6:]], axis=1)
-    pictures = np.full((LENGTH, SIZE, SIZE, 3), 180, np.uint8)
+    pictures = np.broadcast_to(rng.integers(0, 256, 3, np.uint8), (LENGTH, SIZE, SIZE, 3)).copy()
     for t in range(LENGTH):
-        for place, shade in ((state[t, :2], (20, 20, 20)), *((places[name], COLORS[name]) for name in COLORS)):
+        for place, shade in (*((places[name], COLORS[name]) for name in COLORS), (state[t, :2], (0, 0, 0))):
             x, y = (np.asarray(place) / 0.4 * SIZE + SIZE / 2).astype(int)
-            pictures[t, max(y - 3, 0) : y + 3, max(x - 3, 0) : x + 3] = shade
+            pictures[t, max(y - 5, 0) : y + 5, max(x - 5, 0) : x + 5] = shade
     return {"state": state, "abs": absolute, "rel": relative.astype(np.float32), "pictures": pictures}
 
 
@@ -122,7 +125,7 @@ def datasets(tmp_path_factory):
 
 
 def make(kind: str, dataset_meta=None, **options):
-    """A small policy and its pipelines; statistics as if all poses lay in ±4."""
+    """A small policy and its pipelines; without a dataset, statistics as if all poses lay in ±4."""
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
@@ -146,4 +149,4 @@ def make(kind: str, dataset_meta=None, **options):
     policy = get_policy_class(kind)(config, dataset_meta=dataset_meta)
     stats = {"action": {"min": np.full(7, -4.0, np.float32), "max": np.full(7, 4.0, np.float32)}}
     stats["action"]["min"][6], stats["action"]["max"][6] = -1, 1
-    return policy, *make_pre_post_processors(config, dataset_stats=stats)
+    return policy, *make_pre_post_processors(config, dataset_stats=dataset_meta.stats if dataset_meta else stats)

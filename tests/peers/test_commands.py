@@ -8,7 +8,7 @@ import sys
 import pytest
 from safetensors.torch import load_file
 
-from .conftest import FORMS, SMALL, make_dataset
+from .conftest import FORMS, SIZE, SMALL, make_dataset
 
 # Several commands in one process: importing LeRobot takes 20 s; each builds everything anew.
 RUN_IN_TURN = """
@@ -42,6 +42,7 @@ def test_it_trains_resumes_fine_tunes_and_evaluates(kind, tmp_path):
         "--policy.device=cpu",
         "--env.type=calvin",
         f"--env.control_mode={FORMS[kind]}",
+        f"--env.image_size={SIZE}",
         "--env.steps_per_command=8",
     ]
     printed = run(

@@ -43,10 +43,13 @@ def observation(*commands, seed=1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "updates"), [("mcil", 250), ("hulc", 250), ("gr1", 150)])
+@pytest.mark.parametrize(("kind", "updates"), [("mcil", 800), ("hulc", 600), ("gr1", 100)])
 def test_it_learns_32_demonstrations_by_heart(kind, updates, datasets):
-    window = {"window": 8} if kind == "gr1" else {"window": 8, "min_window": 8}
-    policy, prepare, _ = make(kind, **window)
+    options = {"window": 4, "image_size": 32, "dropout": 0.0} if kind == "gr1" else {"window": 4, "min_window": 4}
+    if kind == "hulc":
+        options["recognition_dropout"] = 0.0
+    meta = LeRobotDatasetMetadata("test/squares", root=datasets[FORMS[kind]])
+    policy, prepare, _ = make(kind, dataset_meta=meta, static_shift=0, gripper_shift=0, **options)
     batch = prepare(windows(kind, policy, datasets, range(0, 32 * LENGTH, LENGTH)))
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=2e-3)
     losses = []
@@ -54,6 +57,7 @@ def test_it_learns_32_demonstrations_by_heart(kind, updates, datasets):
         loss, _ = policy.train().forward(batch)
         optimizer.zero_grad()
         loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
         optimizer.step()
         losses.append(loss.item())
     arm, gripper, target = predicted(kind, policy.eval(), batch)
