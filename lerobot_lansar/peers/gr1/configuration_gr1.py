@@ -137,14 +137,16 @@ class GR1Config(PreTrainedConfig):
         """
         if not self.video_only:
             check_features(self, reads_state=True)
-        elif self.input_features:
-            cameras = [k for k, f in self.input_features.items() if f.type is FeatureType.VISUAL and f.shape[0] == 3]
+            return
+        features = self.input_features
+        if features:
+            cameras = [k for k, f in features.items() if f.type is FeatureType.VISUAL and f.shape[0] == 3]
             self.video_camera = self.video_camera or (cameras[0] if cameras else "any camera")
             if self.video_camera not in cameras:
                 raise ValueError(
                     f"--policy.video_only=true finds no {self.video_camera} in the dataset; it has {cameras}."
                 )
-            self.input_features = {}  # those of the desk take their place when the policy is made
+            features.clear()  # those of the desk take their place when the policy is made
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=self.weight_decay, grad_clip_norm=1.0)

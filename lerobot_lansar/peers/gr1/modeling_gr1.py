@@ -180,7 +180,9 @@ def load_image_encoder(encoder: torch.nn.Module, file: str) -> None:
     path = Path(file)
     if not path.is_file():
         raise FileNotFoundError(f"--policy.image_encoder_weights={file}: there is no such file.")
-    weights = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+    weights: dict[str, Any] = (
+        load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+    )
     weights = weights.get("model", weights)
     wanted = encoder.state_dict()
     wrong = [name for name, value in wanted.items() if name not in weights or weights[name].shape != value.shape]

@@ -7,6 +7,7 @@ the rest, and an evaluation asks for [ACT] only.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -57,15 +58,14 @@ class Resampler(nn.Module):
         super().__init__()
         self.latents = nn.Parameter(torch.randn(count, size))
         self.media = nn.Parameter(torch.randn(1, 1, size))
-        self.layers = nn.ModuleList(
-            nn.ModuleList([ResamplerAttention(size, heads, head_size), resampler_mlp(size)]) for _ in range(layers)
-        )
+        self.attentions = nn.ModuleList(ResamplerAttention(size, heads, head_size) for _ in range(layers))
+        self.mlps = nn.ModuleList(resampler_mlp(size) for _ in range(layers))
         self.norm = nn.LayerNorm(size)
 
     def forward(self, patches: Tensor) -> Tensor:
         patches = patches + self.media
         latents = self.latents.expand(len(patches), -1, -1)
-        for attention, mlp in self.layers:  # type: ignore[misc]
+        for attention, mlp in zip(self.attentions, self.mlps, strict=True):
             latents = latents + attention(patches, latents)
             latents = latents + mlp(latents)
         return self.norm(latents)
@@ -104,7 +104,11 @@ class GR1Network(nn.Module):
     Attributes:
         image_encoder: timm's vision transformer, whose first token is the picture's and whose others are patches'.
         patch: Height and width of a patch, pixels.
+        side: Patches in a row of a picture.
     """
+
+    image_encoder: Any
+    places: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -116,10 +120,10 @@ class GR1Network(nn.Module):
         self.image_encoder = timm.create_model(
             config.image_encoder, pretrained=False, num_classes=0, img_size=config.image_size
         )
-        size = self.image_encoder.num_features
-        self.patch = self.image_encoder.patch_embed.patch_size[0]
-        self.side, rest = divmod(config.image_size, self.patch)
-        if rest:
+        size = int(self.image_encoder.num_features)
+        self.patch = int(self.image_encoder.patch_embed.patch_size[0])
+        self.side = config.image_size // self.patch
+        if config.image_size % self.patch:
             raise ValueError(
                 f"--policy.image_size={config.image_size} must be a multiple of the {self.patch} pixels of a patch of "
                 f"--policy.image_encoder={config.image_encoder}."
@@ -145,7 +149,7 @@ class GR1Network(nn.Module):
         layer = nn.TransformerEncoderLayer(
             hidden, config.heads, 4 * hidden, config.dropout, "relu", batch_first=True, norm_first=True
         )
-        layer.dropout = nn.Identity()  # GPT-2 has none between its two linear layers
+        layer.dropout = nn.Dropout(0.0)  # GPT-2 has none between its two linear layers
         self.dropout = nn.Dropout(config.dropout)
         self.transformer = nn.TransformerEncoder(
             layer, config.layers, norm=nn.LayerNorm(hidden), enable_nested_tensor=False
