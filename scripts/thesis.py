@@ -1,12 +1,13 @@
 """The thesis' size, trained and evaluated with and without the recommended choices, on one GPU. Run by `make thesis`.
 
-    python scripts/thesis.py [--minutes=60] [--chains=300] [--device=cuda] [--workers=CORES]
+    python scripts/thesis.py [--minutes=60] [--chains=300] [--device=cuda] [--workers=CORES] [--dataset=FOLDER]
     python scripts/thesis.py --dry_run      # everything with tiny sizes, on a CPU
 
 Record chains on the built-in desk, convert, train both, evaluate both with lansar-eval, compare with lansar-report.
 State and language only: the thesis' row is its "No Image". While the cores record, the GPU measures how fast it trains;
-the number of updates follows from that and from --minutes, and result.json says it. A step whose result exists is
-skipped. A step that fails or exceeds its time ends the run only if nothing can follow it.
+the number of updates follows from that and from --minutes, and result.json says it. With --dataset, nothing is
+recorded: that LeRobotDataset is learned from. A step whose result exists is skipped. A step that fails or exceeds its
+time ends the run only if nothing can follow it. No step asks the network.
 """
 
 import argparse
@@ -106,6 +107,7 @@ class Thesis:
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self.out = Path(options.output_dir).resolve()
+        self.dataset = Path(options.dataset or self.out / "data/lerobot").resolve()
         self.started = time.time()
         self.seconds = 60.0 * options.minutes
         self.problems: list[str] = []
@@ -116,8 +118,10 @@ class Thesis:
         return self.started + self.seconds - time.time()
 
     def record(self) -> None:
-        """Demonstrations, converted."""
+        """Demonstrations, converted; unless they are there already."""
         o, data = self.options, self.out / "data"
+        if (self.dataset / "meta/info.json").exists():
+            return
         workers = max(1, int(RECORDERS * o.workers))
         hours = SHARES["record"] * self.seconds * workers * FRAMES_PER_CORE / (30 * 3600)
         if not (data / "chains/validation").exists():
@@ -135,19 +139,18 @@ class Thesis:
                 f"--workers={workers}",
                 f"--output_dir={data / 'chains'}",
             )
-        if not (data / "lerobot/meta/info.json").exists():
-            run(
-                "convert",
-                self.out / "logs/convert.log",
-                self.left(),
-                "lansar-convert",
-                f"--root={data / 'chains'}",
-                "--split=training",
-                "--repo_id=lansar/chains",
-                "--images=none",
-                f"--workers={o.workers}",
-                f"--output_dir={data / 'lerobot'}",
-            )
+        run(
+            "convert",
+            self.out / "logs/convert.log",
+            self.left(),
+            "lansar-convert",
+            f"--root={data / 'chains'}",
+            "--split=training",
+            "--repo_id=lansar/chains",
+            "--images=none",
+            f"--workers={o.workers}",
+            f"--output_dir={self.dataset}",
+        )
 
     def measure(self) -> None:
         """The speed of training on this device, in benchmark.json."""
@@ -201,7 +204,7 @@ class Thesis:
             "lerobot-train",
             *ROWS[name],
             "--dataset.repo_id=lansar/chains",
-            f"--dataset.root={self.out / 'data/lerobot'}",
+            f"--dataset.root={self.dataset}",
             f"--policy.device={o.device}",
             f"--policy.dtype={'float32' if o.device == 'cpu' else 'bfloat16'}",
             f"--policy.compile_model={str('+compile' in variant).lower()}",
@@ -283,7 +286,7 @@ class Thesis:
             except StepError as error:
                 self.problems.append(str(error))
             measuring.result()
-        if (self.out / "data/lerobot/meta/info.json").exists():
+        if (self.dataset / "meta/info.json").exists():
             evaluating = SHARES["evaluate"] * self.seconds / len(ROWS)
             for number, name in enumerate(ROWS):
                 rest = len(ROWS) - number  # each row gets an equal share of what is left
@@ -301,6 +304,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Trains and evaluates LanSAR at the thesis' size.")
     parser.add_argument("--minutes", type=float, default=60, help="how long everything may take")
     parser.add_argument("--hours", type=float, help="of demonstrations; by default what a fifth of the time records")
+    parser.add_argument("--dataset", help="folder of a LeRobotDataset to learn from instead of recording one")
     parser.add_argument("--chains", type=int, default=300, help="of each evaluation")
     parser.add_argument("--device", default="cuda", help="for training")
     parser.add_argument("--eval_device", help="for evaluation; by default --device")
@@ -308,6 +312,8 @@ def main() -> int:
     parser.add_argument("--output_dir", default="outputs/thesis_size")
     parser.add_argument("--dry_run", action="store_true", help="tiny sizes, on a CPU: whether every step works")
     options = parser.parse_args()
+    if options.dataset and not (Path(options.dataset) / "meta/info.json").exists():
+        parser.error(f"--dataset={options.dataset} is no folder of a LeRobotDataset: it has no meta/info.json")
     if options.dry_run:
         options.device = "cpu"
         options.eval_device = "cpu"
