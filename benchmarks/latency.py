@@ -1,4 +1,5 @@
-"""Milliseconds per control step: LanSAR with and without its key-value cache, and LeRobot's ACT, Diffusion, VQ-BeT.
+"""Milliseconds per control step: LanSAR with and without its key-value cache, its peers, and LeRobot's ACT, Diffusion,
+VQ-BeT.
 
     python benchmarks/latency.py [--device=cpu] [--threads=1] [--environments=1] [--steps=64] [--output=FILE.json]
 
@@ -7,8 +8,8 @@ settings and see the desk's observations: state, static 200 x 200 and gripper 84
 which take one picture or pictures of one size only, see the static one. Times are per executed action: the time of a
 chunk is divided by the actions executed, that of several environments by their number.
 
-LanSAR is measured with a full history, over 64 control steps; with --policy.window_slide=32 it decodes its whole window
-twice in them. At 30 Hz there are 33 ms per step.
+LanSAR and GR-1 are measured with a full history, over 64 control steps; with --policy.window_slide=32 LanSAR decodes its
+whole window twice in them, and MCIL and HULC draw two new plans. At 30 Hz there are 33 ms per step.
 """
 
 import json
@@ -28,6 +29,9 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from tqdm import tqdm
 
+from lerobot_lansar.clip.config import ClipConfig
+from lerobot_lansar.peers import GR1Config, HULCConfig, MCILConfig
+from lerobot_lansar.peers.processor import make_pipelines
 from lerobot_lansar.policy import LanSARConfig, make_lansar_pre_post_processors
 from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 
@@ -138,6 +142,19 @@ def other(options: Options, config: Any, cameras: tuple[str, ...], name: str) ->
     return row(f"{name}, {chunk} actions a prediction", policy, None, seconds, max(times))
 
 
+def peer(options: Options, config: Any, warm_up: int, name: str) -> dict[str, Any]:
+    """One of the thesis' peers at its published size."""
+    config.device, config.clip = options.device, ClipConfig("lansar-desk", "v1")
+    policy = get_policy_class(config.type)(config).to(options.device).eval()
+    preprocess, _ = make_pipelines(config, None)
+    times = []
+    for step in tqdm(range(warm_up + options.steps), desc=name, leave=False):
+        batch = preprocess(observation(options.environments, options.device))
+        seconds = timed(options, lambda: policy.select_action(batch))  # noqa: B023
+        times += [seconds] if step >= warm_up else []
+    return row(name, policy, None, sum(times) / len(times) / options.environments, max(times))
+
+
 def row(
     name: str, policy: torch.nn.Module, preprocessor: float | None, seconds: float, slowest: float
 ) -> dict[str, Any]:
@@ -168,6 +185,9 @@ def main(options: Options) -> None:
         lansar(options, recommended, 8, "LanSAR recommended, steps kept"),
         lansar(ten, recommended, 8, "LanSAR recommended, steps kept, ten environments at once"),
         lansar(options, recommended, 1, "LanSAR recommended, window decoded at every step"),
+        peer(options, MCILConfig(), 1, "MCIL"),
+        peer(options, HULCConfig(), 1, "HULC"),
+        peer(options, GR1Config(), 10, "GR-1"),
         other(options, ACTConfig(pretrained_backbone_weights=None), ("static", "gripper"), "ACT"),
         other(options, VQBeTConfig(pretrained_backbone_weights=None), ("static",), "VQ-BeT"),
         other(options, DiffusionConfig(pretrained_backbone_weights=None), ("static",), "Diffusion"),
