@@ -8,8 +8,8 @@ settings and see the desk's observations: state, static 200 x 200 and gripper 84
 which take one picture or pictures of one size only, see the static one. Times are per executed action: the time of a
 chunk is divided by the actions executed, that of several environments by their number.
 
-LanSAR and GR-1 are measured with a full history, over 64 control steps; with --policy.window_slide=32 LanSAR decodes its
-whole window twice in them, and MCIL and HULC draw two new plans. At 30 Hz there are 33 ms per step.
+LanSAR and GR-1 are measured with a full history, over 64 control steps; with --policy.window_slide=32 LanSAR decodes
+its whole window twice in them, and MCIL and HULC draw two new plans. At 30 Hz there are 33 ms per step.
 """
 
 import json
