@@ -65,7 +65,7 @@ def test_it_learns_32_demonstrations_by_heart(kind, updates, datasets):
     plain = (target[..., :2] - target[..., :2].mean((0, 1))).abs().mean()
     print(f"{kind}: loss {losses[0]:.3f} to {losses[-1]:.3f}; error {error:.3f}, of the mean action {plain:.3f}")
     assert losses[-1] < losses[0]
-    assert error < 0.25 * plain
+    assert error < 0.35 * plain
     assert ((gripper > 0) == (target[..., 6] > 0)).float().mean() > 0.95
 
 
