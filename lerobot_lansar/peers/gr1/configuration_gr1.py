@@ -31,6 +31,8 @@ class GR1Config(PreTrainedConfig):
 
     # A vision transformer of timm with a class token.
     image_encoder: str = "vit_base_patch16_224"
+    # So many of its layers are used; 0: all.
+    image_encoder_layers: int = 0
     # Pictures are brought to this height and width, pixels.
     image_size: int = 224
     # Its weights, which stay as they are: a file in timm's format, or MAE's mae_pretrain_vit_base.pth. Empty: random
@@ -114,6 +116,7 @@ class GR1Config(PreTrainedConfig):
         """What the network needs of these options."""
         return NetworkConfig(
             image_encoder=self.image_encoder,
+            image_encoder_layers=self.image_encoder_layers,
             image_size=self.image_size,
             command_features=embedding_size(self.clip.model),
             hidden=self.hidden,

@@ -23,6 +23,7 @@ class NetworkConfig:
     """Sizes; `GR1Config` explains them."""
 
     image_encoder: str
+    image_encoder_layers: int
     image_size: int
     command_features: int
     hidden: int
@@ -117,9 +118,10 @@ class GR1Network(nn.Module):
 
         self.config = config
         hidden = config.hidden
-        self.image_encoder = timm.create_model(
-            config.image_encoder, pretrained=False, num_classes=0, img_size=config.image_size
-        )
+        sizes: dict[str, Any] = {"img_size": config.image_size}
+        if config.image_encoder_layers:
+            sizes["depth"] = config.image_encoder_layers
+        self.image_encoder = timm.create_model(config.image_encoder, pretrained=False, num_classes=0, **sizes)
         size = int(self.image_encoder.num_features)
         self.patch = int(self.image_encoder.patch_embed.patch_size[0])
         self.side = config.image_size // self.patch
