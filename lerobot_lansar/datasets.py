@@ -1,7 +1,8 @@
-"""Where LeRobot keeps datasets, and the file in which a converted one says where it comes from."""
+"""What several rooms know about LeRobotDatasets: where they are, names in them, and what a policy can read of them."""
 
 import os
 from pathlib import Path
+from typing import Any
 
 from huggingface_hub.constants import HF_HOME
 
@@ -19,6 +20,22 @@ MANIFEST = "meta/calvin_source.json"
 
 VERSION = "v3.0"
 """LeRobot's tag of the dataset format: the revision that it asks the hub for."""
+
+
+def feature_problems(features: dict[str, Any], sizes: dict[str, int]) -> list[str]:
+    """What keeps a policy from reading these features, a sentence each: vectors that are missing or of another size.
+
+    Args:
+        features: Name to a LeRobot feature of a policy, with its `shape`.
+        sizes: Name to the numbers that a vector must have.
+    """
+    problems = []
+    for name, size in sizes.items():
+        if name not in features:
+            problems.append(f"{name} is missing")
+        elif tuple(features[name].shape) != (size,):
+            problems.append(f"{name} has shape {tuple(features[name].shape)}, not ({size},)")
+    return problems
 
 
 def dataset_folder(repo_id: str, folder: Path | None) -> Path:

@@ -53,6 +53,10 @@ def test_the_whole_line_runs_without_a_network(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(CUT_OFF)
     asked = tmp_path / "asked"
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "ASKED": str(asked), "HF_HOME": str(tmp_path / "hf")}
+    knock = "import socket; socket.create_connection(('192.0.2.1', 80))"
+    subprocess.run([sys.executable, "-c", knock], env=environment, capture_output=True)
+    assert asked.read_text() == "192.0.2.1\n", "whoever asks is written down"
+    asked.unlink()
     command = [sys.executable, SCRIPT, "--dry_run", "--workers=1", f"--output_dir={tmp_path / 'out'}"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout[-3000:]

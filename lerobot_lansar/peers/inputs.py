@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..calvin import ACTION_NAMES, CONTROL_MODES, ROBOT_OBS_NAMES
 from ..clip.store import IMAGE_FEATURES, data_files
+from ..datasets import feature_problems
 
 
 def check_features(config: PreTrainedConfig, reads_state: bool) -> None:
@@ -27,11 +28,7 @@ def check_features(config: PreTrainedConfig, reads_state: bool) -> None:
         return  # a policy built by hand
     problems = [f"{name} is missing" for name in IMAGE_FEATURES.values() if name not in features]
     states = {OBS_STATE: len(ROBOT_OBS_NAMES)} if reads_state else {}
-    for name, size in {**states, ACTION: 7}.items():
-        if name not in features:
-            problems.append(f"{name} is missing")
-        elif tuple(features[name].shape) != (size,):
-            problems.append(f"{name} has shape {tuple(features[name].shape)}, not ({size},)")
+    problems += feature_problems(features, {**states, ACTION: 7})
     if problems:
         raise ValueError(
             f"--policy.type={config.type} cannot use these features: {'; '.join(problems)}. It needs "

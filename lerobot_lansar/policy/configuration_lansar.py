@@ -9,6 +9,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from ..clip.config import ClipConfig
 from ..clip.model import embedding_size
+from ..datasets import feature_problems
 from .network import NetworkConfig
 from .optimizer import MuonConfig
 from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM, encoded_sizes
@@ -212,12 +213,8 @@ class LanSARConfig(PreTrainedConfig):
         features = {**(self.input_features or {}), **(self.output_features or {})}
         if not features:
             return  # a policy built by hand; its inputs are checked in `select_action`
-        problems = []
-        for name, size in ((OBS_STATE, STATE_DIM), (OBS_ENV_STATE, ENVIRONMENT_STATE_DIM), (ACTION, 7)):
-            if name not in features:
-                problems.append(f"{name} is missing")
-            elif tuple(features[name].shape) != (size,):
-                problems.append(f"{name} has shape {tuple(features[name].shape)}, not ({size},)")
+        sizes = {OBS_STATE: STATE_DIM, OBS_ENV_STATE: ENVIRONMENT_STATE_DIM, ACTION: 7}
+        problems = feature_problems(features, sizes)
         if problems:
             raise ValueError(
                 f"LanSAR cannot use these features: {'; '.join(problems)}. It needs observation.state (15,), "
