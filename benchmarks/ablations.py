@@ -8,9 +8,11 @@ r"""Which of LanSAR's options help: same demonstrations and updates, several see
     python benchmarks/ablations.py --root=data/chains_lerobot [--variants='[recommended,euler angles]']
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
-Every run is `lerobot-train` on --config with one change, then `lerobot-eval` on the benchmark's first chains, built-in
+Every run is `lerobot-train` on --config with one change, then `lansar-eval` on the benchmark's first chains, built-in
 desk, with sentences that no demonstration was labelled with. Runs that are in --output_dir already are not repeated.
-Prints a Markdown table and writes its numbers to --output_dir/results.json.
+Prints a Markdown table and writes its numbers to --output_dir/results.json. The difference to the first variant is of
+the same seeds on the same chains; its 95 % interval is over the chains of these trainings, so the scatter between
+trainings comes on top.
 """
 
 import hashlib
@@ -27,11 +29,14 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import numpy as np
 import yaml
 from filelock import FileLock
 from tqdm import tqdm
 
 from lerobot_lansar.clip.store import dataset_fingerprint
+from lerobot_lansar.report.episodes import read_lines
+from lerobot_lansar.report.figures import bootstrap
 
 RUN = ("steps", "save_freq", "log_freq", "seed")
 """Options whose values in the configuration file change no result: runs set them, or only log with them."""
@@ -83,6 +88,8 @@ VARIANTS: dict[str, tuple[list[str], list[str]]] = {
         [],
     ),
     "weight decay 0.01": (["--policy.weight_decay=0.01"], []),
+    "weight decay 0.3": (["--policy.weight_decay=0.3"], []),
+    "dropout 0.1": (["--policy.dropout=0.1"], []),
     "changes since the command": (["--policy.since_command=true"], []),
 }
 """Variant to its options of training and of evaluation, which override the configuration file. Variants with the same
@@ -178,7 +185,17 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
         command("lansar-report", f"--eval_dir={folder}", log=log)
     (report,) = json.loads((folder / "report.json").read_text())["tables"][0]["evaluations"]
     figures = {name: report[name] for name in ("average_length", "in_a_row", "local_success_rate", "tasks")}
-    return {"variant": variant, "seed": seed, "train_minutes": minutes, **figures}
+    lengths = {episode.chain: episode.successes for episode in read_lines(folder)}
+    return {"variant": variant, "seed": seed, "train_minutes": minutes, **figures, "lengths": lengths}
+
+
+def to_first(runs: list[dict[str, Any]], first: list[dict[str, Any]]) -> str:
+    """How much longer the chains of one variant are than those of the first with the same seeds."""
+    pairs = list(zip(runs, first, strict=True))
+    chains = sorted(set.intersection(*(set(run["lengths"]) for run in (*runs, *first))))
+    mean = np.mean([[one["lengths"][c] - other["lengths"][c] for c in chains] for one, other in pairs], axis=0)
+    (interval,) = bootstrap([mean])
+    return f"{mean.mean():+.2f}" + (f" [{interval[0]:+.2f}, {interval[1]:+.2f}]" if interval else "")
 
 
 def main() -> None:
@@ -192,16 +209,18 @@ def main() -> None:
         done = list(tqdm(pool.map(lambda run: measure(options, *run), runs), total=len(runs), unit="run"))
     settings = {"config": str(options.config), "updates": options.updates, "chains": options.chains}
     (options.output_dir / "results.json").write_text(json.dumps(settings | {"runs": done}, indent=1) + "\n")
-    print("| variant | average length | 1 | 2 | 3 | 4 | 5 | per command |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
-    for variant in options.variants:
-        mine = [run for run in done if run["variant"] == variant]
+    print("| variant | average length | difference to the first | 1 | 2 | 3 | 4 | 5 | per command |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    by_variant = {name: [run for run in done if run["variant"] == name] for name in options.variants}
+    for variant, mine in by_variant.items():
         lengths = [run["average_length"] for run in mine]
         spread = f" ± {statistics.stdev(lengths):.2f}" if len(lengths) > 1 else ""
         row = [100 * statistics.mean(run["in_a_row"][k] for run in mine) for k in range(5)]
         local = 100 * statistics.mean(run["local_success_rate"] for run in mine)
         shares = " | ".join(f"{share:.0f} %" for share in row)
-        print(f"| {variant} | {statistics.mean(lengths):.2f}{spread} | {shares} | {local:.1f} % |")
+        first = by_variant[options.variants[0]]
+        change = "" if mine is first else to_first(mine, first)
+        print(f"| {variant} | {statistics.mean(lengths):.2f}{spread} | {change} | {shares} | {local:.1f} % |")
 
 
 if __name__ == "__main__":
