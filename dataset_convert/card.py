@@ -18,7 +18,6 @@ _ACTION = {"rel": _REL, "abs": _ABS}
 
 _MEANING = {
     "observation.state": "`robot_obs`: TCP pose (m, rad), gripper width (m), 7 joints (rad), gripper action",
-    "observation.environment_state": "`scene_obs`: slider, drawer, button, switch, bulb, LED; red, blue, pink block",
     "calvin.actions": f"the same action in absolute form: {_ABS}",
     "calvin.rel_actions": f"the same action in relative form: {_REL}",
     "calvin.frame": "frame number in the source",
@@ -34,6 +33,9 @@ _MEANING = {
     **{f"observation.camera_pose.{camera}": "4×4 pose, camera to world (m)" for camera in CAMERAS},
     **{f"observation.camera_intrinsics.{camera}": "3×3 intrinsics (pixels)" for camera in CAMERAS},
 }
+
+_SCENE = "`scene_obs`: slider, drawer, button, switch, bulb, LED; red, blue, pink block"
+_TASK = "1 for the commanded task, 0 for the others (`names` of `meta/info.json`)"
 
 
 def write(root: Path, repo_id: str) -> None:
@@ -96,7 +98,7 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
 
 | feature | shape | stored as | content |
 | --- | --- | --- | --- |
-{_features(info, request["action"])}
+{_features(info, request)}
 
 * **Source:** split `{request["split"]}` of `{request["source"]}`, SHA-256 of its index files
   `{request["source_sha256"]}`, converted with lerobot_policy_lansar {manifest["versions"]["lerobot_policy_lansar"]}.
@@ -107,8 +109,7 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
   that the arm reaches jumps. CALVIN's own roll jumps between π and −π, where a hand that points down has it.
 * **Windows** end before their last number, as in CALVIN.{_windows(manifest, used)}
 * **Scenes:** {scenes}; known from {manifest["scenes_from"]}. Blocks are always red, blue, pink here.
-{_look(manifest)}* **Privileged state:** `observation.environment_state` is the simulator's own state (block poses,
-  joints, lights). A real robot does not have it; results of policies that read it must say so.
+{_look(manifest)}{_privileged(request)}
 {_clip(clip)}{_lang(request)}
 | task | windows |
 | --- | ---: |
@@ -126,17 +127,27 @@ With LeRobot and the plugin lerobot_policy_lansar installed beside it:
 """
 
 
-def _features(info: dict[str, Any], action: str) -> str:
+def _features(info: dict[str, Any], request: dict[str, Any]) -> str:
     rows = []
     for key, feature in info["features"].items():
         if not key.startswith(("observation.", "action", "calvin.", "complementary_info.")):
             continue
         shape = "×".join(str(size) for size in feature["shape"])
-        text = _ACTION[action] if key == "action" else _MEANING.get(key, "fingertip sensor")
-        if key == "observation.environment_state" and shape != "24":
-            text += "; then 1 for the commanded task, 0 for the others (`names` of `meta/info.json`)"
+        text = _ACTION[request["action"]] if key == "action" else _MEANING.get(key, "fingertip sensor")
+        if key == "observation.environment_state":
+            parts = ([_SCENE] if request.get("scene_state", True) else []) + (
+                [_TASK] if request.get("task_in_state") else []
+            )
+            text = "; then ".join(parts)
         rows.append(f"| `{key}` | {shape} | {feature['dtype']} | {text} |")
     return "\n".join(rows)
+
+
+def _privileged(request: dict[str, Any]) -> str:
+    if not request.get("scene_state", True):
+        return "* **Privileged state:** none: the scene's state was left out (`--scene_state=false`)."
+    return """* **Privileged state:** `observation.environment_state` is the simulator's own state (block poses,
+  joints, lights). A real robot does not have it; results of policies that read it must say so."""
 
 
 def _look(manifest: dict[str, Any]) -> str:
@@ -243,25 +254,35 @@ def _lang(request: dict[str, Any]) -> str:
 
 def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
     size = f" --env.image_size={request['image_size']}" if request.get("image_size") else ""
+    scene = "" if request.get("scene_state", True) else " --env.scene_state=false"
+    cameras = " --env.cameras='[]'" if request["images"] == "none" else size
+    cameras += " --env.depth=true" if request["depth"] else ""
+    cameras += " --env.camera_poses=true" if request.get("camera_poses") else ""
     if request.get("task_in_state"):  # for policies that read no language; LanSAR refuses such a dataset
-        cameras = " --env.cameras='[]'" if request["images"] == "none" else size
-        cameras += " --env.depth=true" if request["depth"] else ""
-        cameras += " --env.camera_poses=true" if request.get("camera_poses") else ""
         act = "act_depth" if request["depth"] else "act"
         return f"""    lerobot-train --policy.type={act} --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
-        --env.control_mode={request["action"]} --env.task_in_state=true{cameras}"""
+        --env.control_mode={request["action"]} --env.task_in_state=true{scene}{cameras}"""
     if request["mode"] == "play":
         return f"""    lerobot-train --policy.type=… --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train
 
 for a policy that reads one frame's command at a time. LanSAR learns demonstrations of one command each and refuses
 this dataset; convert with `--mode=windows` for it."""
+    if scene and clip is None:
+        return f"""    lerobot-train --policy.type=… --policy.push_to_hub=false \\
+        --dataset.repo_id={repo_id} --output_dir=outputs/train
+    lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\
+        --env.control_mode={request["action"]}{scene}{cameras}
+
+for a policy that reads language{"" if request["images"] == "none" else " and pictures"}. LanSAR needs embeddings of the
+pictures (`--embed=true`, or `lansar-embed`) and `--policy.use_spatial_context=false`."""
     train, evaluate = " --policy.use_images=false", " --env.cameras='[]'"
     if clip is not None:
         train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"
-        evaluate = size
+        train += " --policy.use_spatial_context=false" if scene else ""
+        evaluate = scene + size
     return f"""    lerobot-train --policy.type=lansar{train} --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\

@@ -103,6 +103,7 @@ def _depth_codec() -> Codec:
 def dataset_features(
     action: str,
     pictures: tuple[Picture, ...],
+    scene_state: bool = True,
     task_in_state: bool = False,
     camera_poses: bool = False,
     interventions: bool = False,
@@ -113,7 +114,8 @@ def dataset_features(
         action: `"rel"` or `"abs"`, the form that `action` holds; the other one is kept as `calvin.actions` or
             `calvin.rel_actions`, names that LeRobot does not take for something a policy should predict.
         pictures: Camera features.
-        task_in_state: The scene's state also says which task is commanded.
+        scene_state: Whether the scene's state is stored.
+        task_in_state: Whether the commanded task is stored, after the scene's state if there is one.
         camera_poses: The cameras' poses and intrinsics are observations too.
         interventions: A column says who acted.
 
@@ -121,9 +123,10 @@ def dataset_features(
         Feature name to {"dtype", "shape", "names"}, LeRobot's own columns (`index`, ...) included.
     """
     other, other_form = ("calvin.actions", "abs") if action == "rel" else ("calvin.rel_actions", "rel")
+    told = [*(SCENE_OBS_NAMES if scene_state else ()), *(_TASK_NAMES if task_in_state else ())]
     features = {
         "observation.state": _vector(ROBOT_OBS_NAMES),
-        "observation.environment_state": _vector([*SCENE_OBS_NAMES, *(_TASK_NAMES if task_in_state else ())]),
+        **({"observation.environment_state": _vector(told)} if told else {}),
         "action": _vector(ACTION_NAMES[action]),
         other: _vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
@@ -153,11 +156,16 @@ def _matrix(numbers: int) -> dict:
 
 
 def empty_info(
-    action: str, pictures: tuple[Picture, ...], task_in_state: bool, camera_poses: bool, interventions: bool
+    action: str,
+    pictures: tuple[Picture, ...],
+    scene_state: bool,
+    task_in_state: bool,
+    camera_poses: bool,
+    interventions: bool,
 ) -> DatasetInfo:
     """The dataset's description before anything is written."""
     has_videos = any(picture.codec for picture in pictures)
-    features = dataset_features(action, pictures, task_in_state, camera_poses, interventions)
+    features = dataset_features(action, pictures, scene_state, task_in_state, camera_poses, interventions)
     return create_empty_dataset_info(CODEBASE_VERSION, CONTROL_HZ, features, has_videos, "panda")
 
 

@@ -51,6 +51,9 @@ class ConvertConfig:
     block_order: str = "checked"
     # What `action` holds: rel (relative) or abs (absolute); the other form is kept in another column.
     action: str = "rel"
+    # Store the simulator's own state of the scene, privileged, in observation.environment_state. Without, policies that
+    # read whatever there is (ACT, Diffusion) know the blocks from pictures only.
+    scene_state: bool = True
     # Tell policies that read no language which task is commanded: 34 more numbers in observation.environment_state,
     # 1 for the commanded task and 0 for the others.
     task_in_state: bool = False
@@ -141,6 +144,7 @@ class ConvertConfig:
         unusual = {
             name: getattr(self, name)
             for name, usual in (
+                ("scene_state", True),
                 ("task_in_state", False),
                 ("is_intervention", False),
                 ("scene", ""),

@@ -64,7 +64,12 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
     pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder, size)
     recorded = records_interventions(split.frame_file(span.start) for span in spans)
     info = features.empty_info(
-        config.action, pictures, config.task_in_state, config.camera_poses, recorded or config.is_intervention
+        config.action,
+        pictures,
+        config.scene_state,
+        config.task_in_state,
+        config.camera_poses,
+        recorded or config.is_intervention,
     )
     job = Job(
         split=split,
@@ -73,6 +78,7 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
         shards=cut_into_shards([len(span) for span in spans], FRAMES_PER_SHARD),
         layout=features.layout_of(info, pictures),
         action=config.action,
+        scene_state=config.scene_state,
         task_in_state=config.task_in_state,
         block_orders=orders,
         sentences=_sentences(split, spans),

@@ -41,7 +41,8 @@ class Job:
         shards: (first, end) of each shard's episodes.
         layout: How the files look.
         action: `"rel"` or `"abs"`.
-        task_in_state: Append the commanded task to the scene's state.
+        scene_state: Keep the scene's state.
+        task_in_state: Append the commanded task to it.
         block_orders: Scene to the colours of its block columns.
         sentences: The commands; a frame's `task_index` is a place in this list.
         task_names, scene_names: What the numbers in `calvin.task` and `calvin.scene` mean.
@@ -58,6 +59,7 @@ class Job:
     shards: list[tuple[int, int]]
     layout: Layout
     action: str
+    scene_state: bool
     task_in_state: bool
     block_orders: dict[str, tuple[str, ...]]
     sentences: list[str]
@@ -320,13 +322,14 @@ def to_batch(job: Job, span: Span, frames: range, windows: np.ndarray, arrays: d
     sentence_of = {w: job.sentences.index(listed[w].sentence if w >= 0 else NO_COMMAND) for w in set(numbers)}
     tasks = np.array([task_of[w] for w in numbers])
     scene = blocks.reorder_blocks(arrays["scene_obs"], job.block_orders[span.scene])
+    told = [scene] if job.scene_state else []
     if job.task_in_state:
-        scene = np.concatenate([scene, tasks[:, None] == np.arange(len(TASKS))], axis=1)
+        told.append(tasks[:, None] == np.arange(len(TASKS)))
     absolute, relative = with_continuous_angles(arrays["actions"]), arrays["rel_actions"]
     is_absolute = job.action == "abs"
     vectors = {
         "observation.state": with_continuous_angles(arrays["robot_obs"]),
-        "observation.environment_state": scene,
+        **({"observation.environment_state": np.concatenate(told, axis=1)} if told else {}),
         "action": absolute if is_absolute else relative,
         "calvin.rel_actions" if is_absolute else "calvin.actions": relative if is_absolute else absolute,
         **pose_columns(arrays["robot_obs"], job.layout.camera_sizes(), job.camera_poses),

@@ -56,8 +56,8 @@ def verify(config: VerifyConfig) -> str:
     _check_stats(dataset, found)
     _check_shared(dataset, found)
     lines = [
-        f"{folder}: {len(dataset.spans)} episodes, {found.frames} frames equal {dataset.split.folder}: state, scene "
-        "and both forms of the action exactly, as are commands, tasks, scenes, windows and times",
+        f"{folder}: {len(dataset.spans)} episodes, {found.frames} frames equal {dataset.split.folder}: all states and "
+        "both forms of the action exactly, as are commands, tasks, scenes, windows and times",
         f"{len(dataset.manifest['left_out'])} defective episodes are listed as left out; no other one is missing",
     ]
     for key, feature in dataset.features.items():

@@ -126,6 +126,7 @@ def check_claims(dataset: Dataset) -> list[str]:
     _check_spans(dataset)
     _check_pictures(dataset)
     _check_interventions(dataset)
+    _check_environment_state(dataset)
     _check_episodes(dataset)
     _check_lang(dataset)
     return _check_clip(dataset)
@@ -265,6 +266,14 @@ def _check_interventions(dataset: Dataset) -> None:
     wanted = dataset.says_who_acted or dataset.manifest["request"].get("is_intervention", False)
     if (INTERVENTION_FEATURE in dataset.features) != wanted:
         raise Mismatch(f"{dataset.folder}/meta/info.json: {INTERVENTION_FEATURE} is {'missing' if wanted else 'there'}")
+
+
+def _check_environment_state(dataset: Dataset) -> None:
+    """The dataset holds the scene's state, or the commanded task, if it says so, and only then."""
+    request, key = dataset.manifest["request"], "observation.environment_state"
+    wanted = request.get("scene_state", True) or request.get("task_in_state", False)
+    if (key in dataset.features) != wanted:
+        raise Mismatch(f"{dataset.folder}/meta/info.json: {key} is {'missing' if wanted else 'there'}")
 
 
 def _check_episodes(dataset: Dataset) -> None:

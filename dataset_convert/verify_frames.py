@@ -178,13 +178,14 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
     order = dataset.orders[span.scene]
     blocks = [6 + 6 * order.index(color) + i for color in COLORS for i in range(6)]
     scene = source["scene_obs"][:, [*range(6), *blocks]]
+    told = scene if manifest["request"].get("scene_state", True) else scene[:, :0]
     if manifest["request"].get("task_in_state"):
-        scene = np.hstack([scene, np.eye(len(TASKS) + 1)[tasks, :-1]])  # task -1 takes the last row: all zeros
+        told = np.hstack([told, np.eye(len(TASKS) + 1)[tasks, :-1]])  # task -1 takes the last row: all zeros
     acted = source[IS_INTERVENTION][:, 0] if dataset.says_who_acted else np.full(n, True)
     number = {row["task"]: row["task_index"] for row in dataset.tasks}
     return {
         "observation.state": _without_jumps(source["robot_obs"]).astype(np.float32),
-        "observation.environment_state": scene.astype(np.float32),
+        **({"observation.environment_state": told.astype(np.float32)} if told.shape[1] else {}),
         "action": action.astype(np.float32),
         name: other.astype(np.float32),
         "calvin.frame": np.arange(span.start + first, span.start + first + n),

@@ -173,6 +173,33 @@ def successes(work, folder):
     return [task["metrics"]["sum_rewards"] for task in info["per_task"]]
 
 
+def test_without_the_scenes_state_lansar_knows_the_blocks_from_pictures(run, work, dataset):
+    blind = [option.replace("me/desk", "me/blind").replace("/data", "/blind") for option in dataset]
+    clip = [option.replace("policy.", "") for option in SMALL_LANSAR if "clip" in option]
+    source = ["--root=desk", "--split=training", "--repo_id=me/blind", "--output_dir=blind"]
+    run("lansar-convert", *source, "--images=none", "--embed=true", *clip, "--scene_state=false")
+    train = [
+        "lerobot-train",
+        "--policy.type=lansar",
+        *blind,
+        *SMALL_LANSAR,
+        *TRAINING,
+        "--steps=1",
+        "--output_dir=out/b",
+    ]
+    assert "environment_state is missing" in run(*train, fails=True)
+    run(*train, "--policy.use_spatial_context=false")
+    evaluate = ["lerobot-eval", "--policy.path=out/b/checkpoints/last/pretrained_model", *EVALUATION]
+    evaluate += ["--env.task=turn_on_led", "--eval.n_episodes=2", "--eval.batch_size=2"]
+    ends = []
+    for name, state in (("without", "false"), ("with", "true")):  # given the state, it looks away
+        folder = f"eval_scene_{name}"
+        run(*evaluate, f"--env.scene_state={state}", f"--env.results_dir={folder}", f"--output_dir={folder}")
+        lines = [json.loads(line) for line in (work / folder / "episodes.jsonl").read_text().splitlines()]
+        ends.append({line["seed"]: line["end"] for line in lines})
+    assert ends[0] == ends[1]
+
+
 def test_the_converted_recording_equals_what_was_recorded(run, dataset):
     printed = run("lansar-verify", "--root=desk", "--repo_id=me/desk", "--dataset_dir=data", "--workers=2")
     assert "8 episodes" in printed

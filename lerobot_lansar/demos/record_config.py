@@ -60,6 +60,8 @@ class TakeoverEnv:
 
     # The policy's actions: rel (relative) or abs (absolute).
     control_mode: str = "rel"
+    # Give the simulator's own state of the scene in environment_state.
+    scene_state: bool = True
     # Add 34 numbers to environment_state, 1 for the commanded task and 0 for the others.
     task_in_state: bool = False
     # Add the cameras' poses and intrinsics.

@@ -29,11 +29,11 @@ from ..desk import Desk, DeskError, SimulationError, is_fulfilled
 from ..desk.desk import Observation
 from ..desk.oracle import Snapshot
 from ..desk.starts import sample_start
-from ..envs.command_line import check_policy, trained_depth_unit
+from ..envs.command_line import check_policy, shapes_read, trained_depth_unit
 from ..envs.configuration_calvin import CalvinEnvConfig
 from ..envs.control_mode import refuse_other_mode
 from ..envs.pictures import Pictures
-from ..envs.spaces import observation_space, observe
+from ..envs.spaces import EnvironmentState, observation_space, observe
 from ..evaluation.loading import load_policy
 from ..evaluation.rows import ResetAtCommands
 from ..evaluation.stream import Episode
@@ -62,8 +62,7 @@ def prepare(config: RecordConfig) -> RecordConfig:
     config = replace(config, policy=policy, env=replace(config.env, depth_unit=unit))
     trained = _policy_config(config)
     features = trained.input_features or {}
-    shapes = {key: tuple(feature.shape) for key, feature in features.items()}
-    check_policy(config.env.task_in_state, pictures_of(config), shapes, option="--")
+    check_policy(environment_state_of(config), pictures_of(config), shapes_read(trained), option="--")
     reads_pictures = getattr(trained, "use_images", True)
     cameras = {key.rsplit(".", 1)[1] for key, feature in features.items() if feature.type is FeatureType.VISUAL}
     missing = {camera.removesuffix("_depth") for camera in cameras} - set(config.cameras)
@@ -105,6 +104,11 @@ def pictures_of(config: RecordConfig) -> Pictures:
     return Pictures(tuple(config.cameras), config.image_size, config.depth, unit, config.env.camera_poses)
 
 
+def environment_state_of(config: RecordConfig) -> EnvironmentState:
+    """What the policy's observations hold in `environment_state`."""
+    return EnvironmentState(config.env.scene_state, config.env.task_in_state)
+
+
 @dataclass(frozen=True)
 class Request:
     """What a session needs an action for.
@@ -129,7 +133,7 @@ class Actor:
     def __init__(self, config: RecordConfig, sessions: Sequence["Session"]):
         policy, self._processors = _loaded(config)
         self._resetting = ResetAtCommands(policy, sessions)
-        self._space = observation_space(pictures_of(config), config.env.task_in_state)
+        self._space = observation_space(pictures_of(config), environment_state_of(config))
         device = str(policy.config.device or "cpu").partition(":")[0]
         self._precision = lambda: torch.autocast(device) if policy.config.use_amp else nullcontext()
 
@@ -156,6 +160,7 @@ def _loaded(config: RecordConfig) -> Any:
             scene=config.scenes[0],
             cameras=config.cameras,
             control_mode=config.env.control_mode,
+            scene_state=config.env.scene_state,
             task_in_state=config.env.task_in_state,
             depth=config.depth,
             depth_unit=config.env.depth_unit,
@@ -301,8 +306,8 @@ class Session:
                     break
 
     def _observe(self, task: str) -> dict[str, Any]:
-        env = self._config.env
-        return observe(self._obs, self._pictures, env.control_mode, task, env.task_in_state)
+        mode, environment_state = self._config.env.control_mode, environment_state_of(self._config)
+        return observe(self._obs, self._pictures, mode, task, environment_state)
 
     def _follow(self, action: np.ndarray) -> bool:
         """One step by the policy; False if the desk refuses its action."""

@@ -21,7 +21,7 @@ from ..pictures import check_size
 from .control_mode import refuse_other_mode
 from .episodes import append_episode
 from .pictures import Pictures
-from .spaces import ACTION_SIZE, action_space, observation_space, observe
+from .spaces import ACTION_SIZE, EnvironmentState, action_space, observation_space, observe
 
 # With an episode's seed: generators apart from the one that draws its start.
 _PERTURBATION_STREAM = (4, 9)
@@ -53,12 +53,12 @@ class CalvinEnv(gym.Env):
     Observation space:
         `agent_pos` (15,): CALVIN's robot_obs, but with the euler angles of `continuous_euler`, as in the datasets of
         this package: they do not jump where the arm works. `environment_state` (24,): CALVIN's scene_obs, blocks in
-        red, blue, pink order; privileged simulator state (58 numbers with `task_in_state`). `pixels`: the pictures
-        named by `cameras`, `static` (200, 200, 3) and `gripper` (84, 84, 3) uint8. `control_mode` (1,): 0 relative,
-        1 absolute. With `depth`, `images.<camera>_depth` (1, n, n) float32: the distance along the
-        camera's axis, in the form in which LeRobot hands depth to policies. With `camera_poses`,
-        `camera_pose.<camera>` (16,) and `camera_intrinsics.<camera>` (9,) float32: the matrices (4, 4) and (3, 3) of
-        `Desk.camera`, row by row.
+        red, blue, pink order; privileged simulator state. With `task_in_state` 34 numbers follow; without `scene_state`
+        those 24 are left out, and the entry if nothing remains. `pixels`: the pictures named by `cameras`, `static`
+        (200, 200, 3) and `gripper` (84, 84, 3) uint8. `control_mode` (1,): 0 relative, 1 absolute. With `depth`,
+        `images.<camera>_depth` (1, n, n) float32: the distance along the camera's axis, in the form in which LeRobot
+        hands depth to policies. With `camera_poses`, `camera_pose.<camera>` (16,) and `camera_intrinsics.<camera>` (9,)
+        float32: the matrices (4, 4) and (3, 3) of `Desk.camera`, row by row.
 
     Rewards: 1 for each fulfilled command, judged by CALVIN's oracle after every step; 0 otherwise. The return of a
         chain is the number of commands fulfilled in a row; its mean over chains is CALVIN's average length.
@@ -98,6 +98,7 @@ class CalvinEnv(gym.Env):
         image_size: Width and height of all pictures and depth in observations; 0: the cameras' own. `resize` in
             `lerobot_lansar.pictures` says how they are brought to that size.
         render_size: Width and height of what `render` returns; 0: the camera's own.
+        scene_state: Whether `environment_state` holds the scene's 24 numbers.
         task_in_state: Whether `environment_state` also holds a number for each of the 34 tasks: 1 for the one that is
             commanded, 0 for the others. For policies that read no language (ACT, Diffusion), trained on what
             `lansar-convert --task_in_state=true` makes.
@@ -124,6 +125,7 @@ class CalvinEnv(gym.Env):
         perturbation_every: int = 0,
         perturbation_scale: float = 0.0,
         render_fps: int = CONTROL_HZ,
+        scene_state: bool = True,
         task_in_state: bool = False,
         depth: bool = False,
         depth_unit: str = "m",
@@ -147,9 +149,9 @@ class CalvinEnv(gym.Env):
         self.sentence = sentence
         self.steps_per_command = steps_per_command
         self.perturbation_every, self.perturbation_scale = perturbation_every, perturbation_scale
-        self.task_in_state = task_in_state
+        self.environment_state = EnvironmentState(scene_state, task_in_state)
         self.render_mode = render_mode
-        self.observation_space = observation_space(self.pictures, task_in_state)
+        self.observation_space = observation_space(self.pictures, self.environment_state)
         self.action_space = action_space(control_mode)
         self._render_size = render_size or CAMERAS["static"]
         self._redraw_every = max(1, round(CONTROL_HZ / render_fps))
@@ -317,7 +319,7 @@ class CalvinEnv(gym.Env):
     def _observation(self) -> dict[str, Any]:
         if "rgb_static" in self._last and self._render_size == CAMERAS["static"]:
             self._picture = (self._steps, self._last["rgb_static"])
-        return observe(self._last, self.pictures, self.control_mode, self._observed_task, self.task_in_state)
+        return observe(self._last, self.pictures, self.control_mode, self._observed_task, self.environment_state)
 
     def _info(self) -> dict[str, Any]:
         successes = self._successes()

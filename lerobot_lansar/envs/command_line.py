@@ -16,7 +16,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES
 from ..calvin import CAMERAS
 from ..command import CommandError
 from .pictures import Pictures
-from .spaces import environment_state_size
+from .spaces import EnvironmentState
 
 
 def refuse_recording(mixed: bool, depth: bool) -> None:
@@ -43,7 +43,10 @@ def refuse_recording(mixed: bool, depth: bool) -> None:
 
 
 def check_policy(
-    task_in_state: bool, pictures: Pictures, trained: dict[str, tuple[int, ...]] | None = None, option: str = "--env."
+    environment_state: EnvironmentState,
+    pictures: Pictures,
+    trained: dict[str, tuple[int, ...]] | None = None,
+    option: str = "--env.",
 ) -> None:
     """Compares the environment's observations with what the command's policy was trained on.
 
@@ -52,27 +55,32 @@ def check_policy(
     tasks.
 
     Args:
-        task_in_state: The environment's option.
+        environment_state: The environment's.
         pictures: Its pictures.
         trained: The shapes of what the policy reads, by key; None: those of the command's policy.
         option: What the names of options about pictures begin with.
 
     Raises:
-        CommandError: `environment_state` differs by the task's 34 numbers; pictures have another size; the policy reads
-            depth and there is none.
+        CommandError: `environment_state` lacks numbers of the scene or of the task, or has them although it should
+            not; pictures have another size; the policy reads depth and there is none.
     """
     shapes = _trained_shapes() if trained is None else trained
-    _check_environment_state(task_in_state, shapes)
+    _check_environment_state(environment_state, shapes)
     _check_pictures(pictures, shapes, option)
 
 
-def _check_environment_state(task_in_state: bool, shapes: dict[str, tuple[int, ...]]) -> None:
-    size, trained = environment_state_size(task_in_state), shapes.get(OBS_ENV_STATE, (None,))[0]
-    if trained == environment_state_size(not task_in_state):
-        raise CommandError(
-            f"the policy was trained on {trained} numbers of {OBS_ENV_STATE}, but the environment gives {size}: "
-            f"set --env.task_in_state={str(not task_in_state).lower()}"
-        )
+def _check_environment_state(given: EnvironmentState, shapes: dict[str, tuple[int, ...]]) -> None:
+    trained = shapes.get(OBS_ENV_STATE, (None,))[0]
+    choices = (EnvironmentState(scene, task) for scene in (True, False) for task in (True, False))
+    wanted = {choice.size: choice for choice in choices}.get(trained or given.size)
+    if wanted is None or wanted == given:
+        return
+    values = {"scene_state": (wanted.scene, given.scene), "task_in_state": (wanted.task, given.task)}
+    options = [f"--env.{name}={str(value).lower()}" for name, (value, now) in values.items() if value != now]
+    raise CommandError(
+        f"the policy was trained on {trained} numbers of {OBS_ENV_STATE}, but the environment gives {given.size}: "
+        f"set {' '.join(options)}"
+    )
 
 
 def _check_pictures(pictures: Pictures, trained: dict[str, tuple[int, ...]], option: str) -> None:
@@ -122,6 +130,14 @@ def _training_of(policy: str) -> dict[str, Any]:
     return json.loads(file.read_text()) if file.is_file() else {}
 
 
+def shapes_read(policy: PreTrainedConfig) -> dict[str, tuple[int, ...]]:
+    """The shapes of what a policy reads, by key."""
+    found = {key: tuple(feature.shape) for key, feature in (policy.input_features or {}).items()}
+    if not getattr(policy, "use_spatial_context", True):  # a LanSAR may have it among its inputs all the same
+        found.pop(OBS_ENV_STATE, None)
+    return found
+
+
 def _trained_shapes() -> dict[str, tuple[int, ...]]:
     """The shapes of what the command's policy reads, by key; empty if that is unknown.
 
@@ -130,8 +146,7 @@ def _trained_shapes() -> dict[str, tuple[int, ...]]:
     """
     policy, dataset = parser.get_path_arg("policy"), parser.parse_arg("dataset.repo_id")
     if policy is not None:
-        features = PreTrainedConfig.from_pretrained(policy).input_features or {}
-        return {key: tuple(feature.shape) for key, feature in features.items()}
+        return shapes_read(PreTrainedConfig.from_pretrained(policy))
     if dataset is None:
         return {}
     file = Path(parser.parse_arg("dataset.root") or HF_LEROBOT_HOME / dataset, "meta", "info.json")

@@ -24,7 +24,7 @@ from .command_line import (
     trained_depth_unit,
 )
 from .pictures import Pictures, camera_keys, depth_key
-from .spaces import ACTION_SIZE, environment_state_size
+from .spaces import ACTION_SIZE, EnvironmentState
 from .suites import suites
 from .vector import ForkedVectorEnv, SerialVectorEnv
 
@@ -69,6 +69,8 @@ class CalvinEnvConfig(EnvConfig):
     perturbation_scale: float = 0.0
     # New pictures per second in LeRobot's videos, from 1 to 30; fewer save time.
     render_fps: int = CONTROL_HZ
+    # Give the simulator's own state of the scene in environment_state; without, only pictures show the blocks.
+    scene_state: bool = True
     # Add 34 numbers to environment_state, 1 for the commanded task and 0 for the others: for policies that read no
     # language, trained on what lansar-convert --task_in_state=true makes.
     task_in_state: bool = False
@@ -99,9 +101,10 @@ class CalvinEnvConfig(EnvConfig):
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_SIZE,)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(ROBOT_OBS_NAMES),)),
-            "environment_state": PolicyFeature(FeatureType.ENV, (environment_state_size(self.task_in_state),)),
         }
-        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
+        if size := self._environment_state().size:
+            self._add("environment_state", OBS_ENV_STATE, FeatureType.ENV, (size,))
         for camera in self.cameras:
             if camera not in CAMERAS:
                 raise CommandError(f"--env.cameras: {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
@@ -112,6 +115,9 @@ class CalvinEnvConfig(EnvConfig):
             raise CommandError(f"--env.{error}") from error
         for camera in self.cameras:
             self._describe(camera)
+
+    def _environment_state(self) -> EnvironmentState:
+        return EnvironmentState(self.scene_state, self.task_in_state)
 
     def _pictures(self) -> Pictures:
         unit = self.depth_unit or DEFAULT_DEPTH_UNIT
@@ -152,6 +158,7 @@ class CalvinEnvConfig(EnvConfig):
             "perturbation_every",
             "perturbation_scale",
             "render_fps",
+            "scene_state",
             "task_in_state",
             "depth",
             "camera_poses",
@@ -166,12 +173,12 @@ class CalvinEnvConfig(EnvConfig):
         """Processors that change nothing. LeRobot asks for them before the first step, in training too.
 
         Raises:
-            CommandError: The command's policy was trained with another `environment_state`, without or with
-                `--env.task_in_state`, or on pictures of another size, or on depth. Or the command records what LeRobot
-                would mix up or cannot store.
+            CommandError: The command's policy was trained with another `environment_state`
+                (`--env.scene_state`, `--env.task_in_state`), or on pictures of another size, or on depth. Or the
+                command records what LeRobot would mix up or cannot store.
         """
         refuse_recording(mixed=self.sentence == "random" or LH_MTLC in self.suites(), depth=self.depth)
-        check_policy(self.task_in_state, self._pictures())
+        check_policy(self._environment_state(), self._pictures())
         return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[])
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:

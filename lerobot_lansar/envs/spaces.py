@@ -1,5 +1,6 @@
 """Observation and action spaces of `CalvinEnv`."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,30 +27,48 @@ _ABSOLUTE_LOW = (-1.0, -1.0, 0.2, *(HOME_EULER - _TURNS), -1.0)
 _ABSOLUTE_HIGH = (1.0, 1.0, 1.0, *(HOME_EULER + _TURNS), 1.0)
 
 
-def environment_state_size(task_in_state: bool) -> int:
-    """How many numbers `environment_state` holds."""
-    return len(SCENE_OBS_NAMES) + (len(TASKS) if task_in_state else 0)
+@dataclass(frozen=True)
+class EnvironmentState:
+    """What `environment_state` holds; there is no such entry if it holds nothing.
+
+    Attributes:
+        scene: The scene's 24 numbers, privileged simulator state.
+        task: 34 numbers, 1 for the commanded task and 0 for the others.
+    """
+
+    scene: bool = True
+    task: bool = False
+
+    @property
+    def size(self) -> int:
+        """How many numbers these are."""
+        return len(SCENE_OBS_NAMES) * self.scene + len(TASKS) * self.task
+
+    def observe(self, scene_obs: np.ndarray, task: str) -> dict[str, np.ndarray]:
+        """The entry of an observation, if there is one: from (24,) and the commanded task."""
+        parts = ([scene_obs] if self.scene else []) + ([[float(name == task) for name in TASKS]] if self.task else [])
+        return {"environment_state": np.concatenate(parts)} if parts else {}
 
 
-def observation_space(pictures: Pictures, task_in_state: bool) -> spaces.Dict:
+def observation_space(pictures: Pictures, environment_state: EnvironmentState) -> spaces.Dict:
     """The space of the observations that `CalvinEnv` describes."""
-    sizes = {"agent_pos": len(ROBOT_OBS_NAMES), "environment_state": environment_state_size(task_in_state)}
+    sizes = {"agent_pos": len(ROBOT_OBS_NAMES), "environment_state": environment_state.size}
     entries: dict[str, spaces.Space] = {
-        key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in sizes.items()
+        key: spaces.Box(-np.inf, np.inf, (size,), np.float64) for key, size in sizes.items() if size
     }
     entries["control_mode"] = spaces.Box(0, 1, (1,), np.float32)
     return spaces.Dict({**entries, **pictures.spaces()})
 
 
-def observe(obs: Observation, pictures: Pictures, control_mode: str, task: str, task_in_state: bool) -> dict[str, Any]:
+def observe(
+    obs: Observation, pictures: Pictures, control_mode: str, task: str, environment_state: EnvironmentState
+) -> dict[str, Any]:
     """What a policy is given of one of the desk's observations, as `CalvinEnv` describes it; in `observation_space`."""
-    state, robot = obs["scene_obs"], obs["robot_obs"].copy()
+    robot = obs["robot_obs"].copy()
     robot[3:6] = continuous_euler(robot[3:6])
-    if task_in_state:
-        state = np.concatenate([state, [float(name == task) for name in TASKS]])
     return {
         "agent_pos": robot,
-        "environment_state": state,
+        **environment_state.observe(obs["scene_obs"], task),
         "control_mode": np.array([CONTROL_MODES.index(control_mode)], dtype=np.float32),
         **pictures.observe(obs),
     }

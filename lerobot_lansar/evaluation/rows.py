@@ -11,9 +11,6 @@ from torch import Tensor, nn
 from ..command import CommandError
 from .stream import Episode
 
-LEAST_ROWS = 4
-"""LanSAR's actions do not depend on the size of its batch, not even in rounding, from so many rows on."""
-
 
 class Stream(Protocol):
     """An environment of the batch: an `EpisodeStream`, or a session of `lansar-record --mode=takeovers`.
@@ -30,7 +27,8 @@ class Stream(Protocol):
 class ResetAtCommands(nn.Module):
     """A policy in LeRobot's `rollout`, which itself resets a policy once per batch of episodes.
 
-    LanSAR keeps a history for each environment and can clear one of them (`reset_environments`). Other policies keep
+    LanSAR keeps a history for each environment and can clear one of them (`reset_environments`); it computes the same
+    for each in any batch of at least `least_rows`, so smaller ones are filled up with copies. Other policies keep
     one queue of predicted actions for the whole batch: each environment gets a copy of its own, which shares the
     weights, and a random generator of its own, so that what a copy does depends on its episode alone.
 
@@ -60,8 +58,7 @@ class ResetAtCommands(nn.Module):
         new = [i for i, stream in enumerate(self._streams) if stream.commands != self._begun[i]]
         self._begun = [stream.commands for stream in self._streams]
         if self._in_batch:
-            # Fewer rows would round otherwise: the first one fills up.
-            rows = [*range(environments), *[0] * (LEAST_ROWS - environments)]
+            rows = [*range(environments), *[0] * (self._policy.least_rows - environments)]  # type: ignore[operator]
             self._policy.reset_environments(k for k, i in enumerate(rows) if i in new)  # type: ignore[operator]
             return self._policy.select_action(_rows(batch, rows, environments))[:environments]
         for i in new:

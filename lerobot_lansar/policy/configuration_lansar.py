@@ -60,7 +60,8 @@ class LanSARConfig(PreTrainedConfig):
     mlp_norm: str = "batch"
     # The context includes the static and the gripper picture, as CLIP embeddings.
     use_images: bool = True
-    # The context includes the state of robot, blocks and scene. The decoder sees the robot's state in any case.
+    # The context includes the state of robot, blocks and scene. Without, no observation.environment_state is needed.
+    # The decoder sees the robot's state in any case.
     use_spatial_context: bool = True
     # The context includes the command, which also decides what its CLS token attends to.
     command_in_context: bool = True
@@ -213,17 +214,20 @@ class LanSARConfig(PreTrainedConfig):
         features = {**(self.input_features or {}), **(self.output_features or {})}
         if not features:
             return  # a policy built by hand; its inputs are checked in `select_action`
-        sizes = {OBS_STATE: STATE_DIM, OBS_ENV_STATE: ENVIRONMENT_STATE_DIM, ACTION: 7}
+        sizes = {OBS_STATE: STATE_DIM, ACTION: 7}
+        if self.use_spatial_context:
+            sizes[OBS_ENV_STATE] = ENVIRONMENT_STATE_DIM
         problems = feature_problems(features, sizes)
         if problems:
+            needed = [f"{name} ({size},)" for name, size in sizes.items()]
             raise ValueError(
-                f"LanSAR cannot use these features: {'; '.join(problems)}. It needs observation.state (15,), "
-                "observation.environment_state (24,) and action (7,) in CALVIN's conventions, as lansar-convert writes "
-                "them and --env.type=calvin provides them. Leave task_in_state off: LanSAR reads the command itself."
+                f"LanSAR cannot use these features: {'; '.join(problems)}. It needs {', '.join(needed)} in CALVIN's "
+                "conventions, as lansar-convert writes them and --env.type=calvin provides them. Leave task_in_state "
+                f"off: LanSAR reads the command itself. Without {OBS_ENV_STATE} set --policy.use_spatial_context=false."
             )
-        if not self.use_images and self.input_features:
-            for name in [k for k, f in self.input_features.items() if f.type is FeatureType.VISUAL]:
-                del self.input_features[name]
+        kinds = {FeatureType.VISUAL: self.use_images, FeatureType.ENV: self.use_spatial_context}
+        for name in [k for k, f in (self.input_features or {}).items() if not kinds.get(f.type, True)]:
+            del self.input_features[name]  # type: ignore[index]
 
     def get_optimizer_preset(self) -> OptimizerConfig:
         if self.optimizer == "muon":

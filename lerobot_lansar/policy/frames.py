@@ -29,19 +29,17 @@ from .scaling import ENVIRONMENT_STATE_DIM, STATE_DIM
 CACHE = ".cache/huggingface/lansar_frames"
 """Where a dataset keeps its arrays: the hub's client never uploads this folder."""
 
-COLUMNS = {
-    "state": ("observation.state", STATE_DIM),
-    "environment_state": ("observation.environment_state", ENVIRONMENT_STATE_DIM),
-    "action": ("action", 7),
-}
+COLUMNS = {"state": ("observation.state", STATE_DIM), "action": ("action", 7)}
 """Array to the dataset's column and its width."""
+SCENE = {"environment_state": ("observation.environment_state", ENVIRONMENT_STATE_DIM)}
+"""The same, but there is no array where the column is missing or has another width."""
 NUMBERS = ("index", "episode_index", "task_index")
 """LeRobot's columns with one number per frame that are read too."""
 TASK_COLUMN = "calvin.task"
 """The column with the number of each frame's CALVIN task, -1 for none."""
 
 
-OPTIONAL = {"is_intervention": INTERVENTION_FEATURE}
+FLAGS = {"is_intervention": INTERVENTION_FEATURE}
 """Array to the dataset's column, with one truth value per frame; without the column there is no array."""
 
 
@@ -49,9 +47,9 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
     """Reads every frame's numbers from the parquet files, sorted by `index`.
 
     Returns:
-        Index (T,) int64; state (T, 15), environment_state (T, 24), action (T, 7) float32; first and end (T,) int64,
-        the rows where the frame's episode begins and ends (end exclusive); is_intervention (T,) bool, whether the
-        demonstrator acted, if the dataset has that column.
+        Index (T,) int64; state (T, 15), action (T, 7) float32; first and end (T,) int64, the rows where the frame's
+        episode begins and ends (end exclusive). If the dataset has it, environment_state (T, 24) float32 and
+        is_intervention (T,) bool, whether the demonstrator acted.
 
     Raises:
         ValueError: A missing column, a wrong width, NaN or infinity, an index that occurs twice, or an episode with
@@ -81,17 +79,20 @@ def read_frames(root: Path) -> dict[str, np.ndarray]:
 def _read_file(path: Path) -> dict[str, np.ndarray]:
     """The arrays of `NUMBERS` and `COLUMNS` in one parquet file; raises what `read_frames` does about columns."""
     present = pq.read_schema(path).names
-    wanted = [*NUMBERS, *(column for column, _ in COLUMNS.values())]
+    columns = COLUMNS | {name: entry for name, entry in SCENE.items() if entry[0] in present}
+    wanted = [*NUMBERS, *(column for column, _ in columns.values())]
     missing = [name for name in wanted if name not in present]
     if missing:
         raise ValueError(
-            f"{path} has no column {', '.join(missing)}; LanSAR trains on observation.state, "
-            "observation.environment_state and action as lansar-convert writes them."
+            f"{path} has no column {', '.join(missing)}; LanSAR trains on observation.state and action as "
+            "lansar-convert writes them."
         )
     table = pq.read_table(path, columns=wanted)
     frames = {name: table[name].to_numpy() for name in NUMBERS}
-    for name, (column, width) in COLUMNS.items():
+    for name, (column, width) in columns.items():
         values = np.concatenate([chunk.flatten().to_numpy() for chunk in table[column].chunks])
+        if len(values) != width * len(table) and name in SCENE:
+            continue
         if len(values) != width * len(table):
             raise ValueError(f"{path}: {column} must hold {width} numbers per frame.")
         values = values.reshape(-1, width).astype(np.float32)
@@ -102,7 +103,7 @@ def _read_file(path: Path) -> dict[str, np.ndarray]:
                 f"(index {frames['index'][row]}). Remove the episode or convert the dataset again."
             )
         frames[name] = values
-    for name, column in OPTIONAL.items():
+    for name, column in FLAGS.items():
         if column in present:
             frames[name] = pq.read_table(path, columns=[column])[column].to_numpy().astype(bool)
     return frames
@@ -129,7 +130,8 @@ def load_frames(root: Path) -> dict[str, np.ndarray]:
             if not cache.is_dir():  # not there either because another process was faster
                 logging.warning(f"Cannot keep LanSAR's frame arrays in {cache} ({error.strerror}).")
                 return frames
-    names = ["index", *COLUMNS, "first", "end", *(name for name in OPTIONAL if (cache / f"{name}.npy").exists())]
+    there = [name for name in (*SCENE, *FLAGS) if (cache / f"{name}.npy").exists()]
+    names = ["index", *COLUMNS, "first", "end", *there]
     return {name: np.load(cache / f"{name}.npy", mmap_mode="r") for name in names}
 
 

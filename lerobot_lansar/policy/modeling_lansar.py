@@ -51,9 +51,6 @@ class History:
     states: Tensor
 
 
-SMALLEST_GROUP = 4
-"""Environments that are decoded together at least: for fewer rows, matrix products round in another order."""
-
 TRAINED_OPTIONS = (
     "hidden",
     "context_layers",
@@ -94,6 +91,9 @@ class LanSARPolicy(PreTrainedPolicy):
     config_class = LanSARConfig
     name = "lansar"
     config: LanSARConfig
+    # From so many environments on, actions do not depend on their number, not even in rounding: for fewer rows, some
+    # CPUs add up matrix products in another order.
+    least_rows = 16
     # The units that FSDP shards: for Accelerate, and for LeRobot after 0.6.
     _no_split_modules = _fsdp_wrap_modules = ("EncoderLayer", "DecoderLayer")
 
@@ -118,12 +118,13 @@ class LanSARPolicy(PreTrainedPolicy):
             root, features = dataset_meta.root, dataset_meta.features
             windows = Windows(root, features, dataset_meta.total_frames, config, self.image_encoder)
             _drop_videos(features)
-            environment_state = windows.frames["environment_state"]
+            scene = windows.frames["environment_state"] if config.use_spatial_context else None
+            start = scene[windows.frames["first"]] if scene is not None and config.since_command else None
             self.scaler.fit(
                 torch.tensor(windows.frames["state"]),
-                torch.tensor(environment_state),
+                None if scene is None else torch.tensor(scene),
                 torch.tensor(windows.targets[windows.has_target & windows.is_demonstrated, :6]),
-                torch.tensor(environment_state[windows.frames["first"]]) if config.since_command else None,
+                None if start is None else torch.tensor(start),
             )
             set_current(windows)
             if config.compile_model:
@@ -227,7 +228,7 @@ class LanSARPolicy(PreTrainedPolicy):
         valid_steps, state = batch[VALID_STEPS], batch[OBS_STATE]
         if self.training and self.config.state_noise:
             state = self._add_noise(state)
-        inputs = self.scaler.encode(state, batch[OBS_ENV_STATE], batch.get(START))
+        inputs = self.scaler.encode(state, self._environment_state(batch), batch.get(START))
         pictures = self._embed_windows(batch) if self.image_encoder else [batch.get(k) for k in CLIP_IMAGE.values()]
         motion, logit, contrast = self.network(
             batch[CLIP_COMMAND], *inputs, valid_steps, *pictures, batch.get(COMMAND_TASKS)
@@ -263,9 +264,10 @@ class LanSARPolicy(PreTrainedPolicy):
         """One action per environment, in the control mode that the environment takes.
 
         Args:
-            batch: A preprocessed observation: observation.state (B, 15), observation.environment_state (B, 24),
-                observation.clip.* (B, D), with `finetune_clip` observation.images.* (B, 3, H, W) in [0, 1] instead of
-                those of pictures, task (B sentences) and, if the environment provides it,
+            batch: A preprocessed observation: observation.state (B, 15), with `use_spatial_context`
+                observation.environment_state (B, 24), observation.clip.* (B, D), with `finetune_clip`
+                observation.images.* (B, 3, H, W) in [0, 1] instead of those of pictures, task (B sentences) and, if
+                the environment provides it,
                 observation.control_mode (B, 1): 0 for "rel", 1 for "abs". Without it, the option `control_mode` holds.
 
         Returns:
@@ -278,7 +280,8 @@ class LanSARPolicy(PreTrainedPolicy):
         """
         if self.training:
             self.eval()
-        state, environment_state = batch[OBS_STATE].float(), batch[OBS_ENV_STATE].float()
+        state = batch[OBS_STATE].float()
+        environment_state = self._environment_state(batch)
         self._check(batch, state, environment_state)
         inputs = [state, environment_state, batch[CLIP_COMMAND]]
         self._clear_old_histories(batch["task"])
@@ -290,8 +293,21 @@ class LanSARPolicy(PreTrainedPolicy):
             motion, logit = self._predict(*inputs)
             return self._to_action(state, motion, logit, batch.get("observation.control_mode"))
 
-    def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor) -> None:
-        sizes = ((OBS_STATE, state, STATE_DIM), (OBS_ENV_STATE, environment_state, ENVIRONMENT_STATE_DIM))
+    def _environment_state(self, batch: dict[str, Any]) -> Tensor | None:
+        """What the policy reads of the scene: (..., 24), or None with `use_spatial_context` off."""
+        if not self.config.use_spatial_context:
+            return None
+        if OBS_ENV_STATE not in batch:
+            raise ValueError(
+                f"there is no {OBS_ENV_STATE}, which this policy reads (--policy.use_spatial_context=true): set "
+                "--env.scene_state=true"
+            )
+        return batch[OBS_ENV_STATE].float()
+
+    def _check(self, batch: dict[str, Any], state: Tensor, environment_state: Tensor | None) -> None:
+        sizes = [(OBS_STATE, state, STATE_DIM)]
+        if environment_state is not None:
+            sizes.append((OBS_ENV_STATE, environment_state, ENVIRONMENT_STATE_DIM))
         for name, value, size in sizes:
             if value.ndim != 2 or value.shape[1] != size:
                 hint = " LanSAR reads the command itself: --env.task_in_state=false." if name == OBS_ENV_STATE else ""
@@ -324,13 +340,15 @@ class LanSARPolicy(PreTrainedPolicy):
     def _predict(
         self,
         state: Tensor,
-        environment_state: Tensor,
+        environment_state: Tensor | None,
         command: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Adds one step to the histories: (B, 15), (B, 24), (B, D)... -> scaled motion (B, 6), gripper logits (B,)."""
-        start = self._starts(environment_state) if self.config.since_command else None
+        start = None
+        if environment_state is not None and self.config.since_command:
+            start = self._starts(environment_state)
         x, blocks, scene = self.scaler.encode(state, environment_state, start)
         commands = self._encode_commands(command)
         modalities = self.network.encode_modalities(x, blocks, scene, static, gripper)
@@ -368,16 +386,18 @@ class LanSARPolicy(PreTrainedPolicy):
     def _decode_newest(self, commands: tuple[Tensor, Tensor]) -> Tensor:
         """The decoder's output at each environment's newest step, (B, h); steps in the cache are not decoded again.
 
-        An environment's output does not depend on the others, not even in rounding: smaller groups are filled up with
-        copies, and all keys of the cache always take part. (Measured on a CPU with `hidden` 96 and 512, in batches of
-        at least `SMALLEST_GROUP`. With layers of odd widths, such as `hidden` 32 has, it does.)
+        In a batch of at least `least_rows` an environment's output does not depend on the others, not even in rounding:
+        groups with fewer new steps are filled up with copies, and all keys of the cache always take part. (Measured on
+        two kinds of CPU with `hidden` 96 and 512. With layers of odd widths, such as `hidden` 32 has, it does.)
         """
         newest = torch.empty_like(commands[0])
         groups: dict[tuple[int, bool], list[int]] = {}  # environments with the same number of new steps
         for i, (history, held) in enumerate(zip(self._histories, self._cache.steps, strict=True)):
             groups.setdefault((len(history.contexts) - held, held == 0), []).append(i)
         for (new, _), members in groups.items():
-            members = members + members[:1] * (min(SMALLEST_GROUP, len(self._histories)) - len(members))
+            # A product has a row for each new step of each environment.
+            least = min(len(self._histories), -(-self.least_rows // new))
+            members = members + members[:1] * (least - len(members))
             cache = self._cache.add(members, new)
             histories = [self._histories[i] for i in members]
             contexts = torch.stack([history.contexts[-new:] for history in histories])

@@ -277,8 +277,8 @@ class LanSARNetwork(nn.Module):
         self,
         command: Tensor,
         state: Tensor,
-        blocks: Tensor,
-        scene: Tensor,
+        blocks: Tensor | None,
+        scene: Tensor | None,
         valid_steps: Tensor,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
@@ -288,7 +288,8 @@ class LanSARNetwork(nn.Module):
 
         Args:
             command: (B, D) CLIP text embeddings.
-            state, blocks, scene: (B, n, state_dim), (B, n, 3, block_dim) and (B, n, scene_dim), all scaled.
+            state, blocks, scene: (B, n, state_dim), (B, n, 3, block_dim) and (B, n, scene_dim), all scaled; blocks
+                and scene are needed with `use_spatial_context`.
             valid_steps: (N,) int64, which of the B * n steps are not padding, ascending; each window's come first in
                 it. Indices, not a mask: no GPU sync to learn the count.
             static, gripper: (B, n, D) CLIP image embeddings, needed with `use_images`.
@@ -299,7 +300,9 @@ class LanSARNetwork(nn.Module):
             `contrastive` or `command_tasks`.
         """
         batch, n = state.shape[:2]
-        state, blocks, scene = (x.flatten(0, 1)[valid_steps] for x in (state, blocks, scene))
+        state = state.flatten(0, 1)[valid_steps]
+        if blocks is not None and scene is not None:
+            blocks, scene = blocks.flatten(0, 1)[valid_steps], scene.flatten(0, 1)[valid_steps]
         if static is not None and gripper is not None:
             static, gripper = static.flatten(0, 1)[valid_steps], gripper.flatten(0, 1)[valid_steps]
         commands = self.encode_command(command)
@@ -329,8 +332,8 @@ class LanSARNetwork(nn.Module):
     def encode_modalities(
         self,
         state: Tensor,
-        blocks: Tensor,
-        scene: Tensor,
+        blocks: Tensor | None,
+        scene: Tensor | None,
         static: Tensor | None = None,
         gripper: Tensor | None = None,
     ) -> Tensor:
@@ -338,7 +341,7 @@ class LanSARNetwork(nn.Module):
 
         Args:
             state, blocks, scene: (N, state_dim), (N, 3, block_dim) for red, blue and pink, and (N, scene_dim), all
-                scaled.
+                scaled; blocks and scene are read only with `use_spatial_context`.
             static, gripper: (N, D) CLIP embeddings of the two pictures; read only with `use_images`.
 
         Returns:
@@ -347,6 +350,8 @@ class LanSARNetwork(nn.Module):
         c = self.config
         tokens = []
         if c.use_spatial_context:
+            assert blocks is not None
+            assert scene is not None
             blocks = self.block_context(blocks.flatten(0, 1)).unflatten(0, (-1, 3))
             tokens += [self.state_context(state)[:, None], blocks, self.scene_context(scene)[:, None]]
         if c.use_images:

@@ -12,7 +12,7 @@ With `finetune_clip` the policy itself embeds pictures.
 The batch then holds, in training and (without the axis n) in evaluation:
 
     observation.state              (B, n, 15)
-    observation.environment_state  (B, n, 24)
+    observation.environment_state  (B, n, 24) with `use_spatial_context`
     observation.clip.command       (B, D)
     observation.clip.static        (B, n, D) with `use_images`, unless `finetune_clip`
     observation.clip.gripper       (B, n, D) likewise
@@ -80,10 +80,11 @@ class WindowStep(ProcessorStep):
         observation = {
             key: value
             for key, value in (transition.get(TransitionKey.OBSERVATION) or {}).items()
-            if not key.startswith("observation.images.")  # of the sampled frames
+            if not key.startswith("observation.images.") and key != OBS_ENV_STATE  # of the sampled frames
         }
         observation[OBS_STATE] = window["state"]
-        observation[OBS_ENV_STATE] = window["environment_state"]
+        if "environment_state" in window:
+            observation[OBS_ENV_STATE] = window["environment_state"]
         keys = IMAGE_FEATURES if self.windows.pictures else CLIP_IMAGE
         observation.update({key: window[name] for name, key in keys.items() if name in window})
         new = transition.copy()

@@ -62,9 +62,12 @@ class Scaler(nn.Module):
         position, euler = pose.split(3, dim=-1)
         return torch.cat([position, euler.sin(), euler.cos()], dim=-1)
 
-    def _encode(self, state: Tensor, environment_state: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """(..., 15), (..., 24) and (..., 24) -> robot state, flat blocks and scene, not scaled."""
-        x = torch.cat([self._encode_pose(state[..., TCP_POSE]), state[..., TCP_POSE.stop :]], dim=-1)
+    def _encode_robot(self, state: Tensor) -> Tensor:
+        """(..., 15) -> robot state, not scaled."""
+        return torch.cat([self._encode_pose(state[..., TCP_POSE]), state[..., TCP_POSE.stop :]], dim=-1)
+
+    def _encode_scene(self, state: Tensor, environment_state: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
+        """(..., 15), (..., 24) and (..., 24) -> flat blocks and scene, not scaled."""
         poses = environment_state[..., BLOCKS].unflatten(-1, (len(COLORS), 6))
         blocks = self._encode_pose(poses)
         if self.egocentric_blocks:
@@ -77,17 +80,20 @@ class Scaler(nn.Module):
             moved, turned = change[..., BLOCKS].unflatten(-1, (len(COLORS), 6)).split(3, dim=-1)
             blocks = torch.cat([blocks, moved, turned.sin(), turned.cos()], dim=-1)
             scene = torch.cat([change[..., FURNITURE], scene], dim=-1)
-        return x, blocks.flatten(-2), scene
+        return blocks.flatten(-2), scene
 
     def encode(
-        self, state: Tensor, environment_state: Tensor, start: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        self, state: Tensor, environment_state: Tensor | None, start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """CALVIN's (..., 15) and (..., 24) -> scaled X (..., 15 or 18), B (..., 3, 6 to 24), S (..., 6 or 12).
 
-        `start`, the environment state when the command began, (..., 24), is needed with `since_command` only.
+        Without an environment state there are no B and S. `start`, the environment state when the command began,
+        (..., 24), is needed with `since_command` only.
         """
-        x, blocks, scene = self._encode(state, environment_state, start)
-        x = (x - self.state_mean) / self.state_std
+        x = (self._encode_robot(state) - self.state_mean) / self.state_std
+        if environment_state is None:
+            return x, None, None
+        blocks, scene = self._encode_scene(state, environment_state, start)
         blocks = (blocks - self.blocks_mean) / self.blocks_std
         scene = (scene - self.scene_mean) / self.scene_std
         return x, blocks.unflatten(-1, (len(COLORS), -1)), scene
@@ -101,21 +107,20 @@ class Scaler(nn.Module):
         return delta * self.delta_std + self.delta_mean
 
     @torch.no_grad()
-    def fit(self, state: Tensor, environment_state: Tensor, delta: Tensor, start: Tensor | None = None) -> None:
+    def fit(self, state: Tensor, environment_state: Tensor | None, delta: Tensor, start: Tensor | None = None) -> None:
         """Sets the statistics from all frames of a dataset.
 
         Args:
-            state, environment_state: (T, 15) and (T, 24).
+            state: (T, 15).
+            environment_state: (T, 24), or None where nothing is encoded of it.
             delta: (M, 6) target motions in m and rad.
             start: (T, 24), the environment state when each frame's command began; needed with `since_command` only.
         """
-        x, blocks, scene = self._encode(state, environment_state, start)
-        for name, values, floor in (
-            ("state", x, INPUT_FLOOR),
-            ("blocks", blocks, INPUT_FLOOR),
-            ("scene", scene, INPUT_FLOOR),
-            ("delta", delta, DELTA_FLOOR),
-        ):
+        columns = [("state", self._encode_robot(state), INPUT_FLOOR), ("delta", delta, DELTA_FLOOR)]
+        if environment_state is not None:
+            blocks, scene = self._encode_scene(state, environment_state, start)
+            columns += [("blocks", blocks, INPUT_FLOOR), ("scene", scene, INPUT_FLOOR)]
+        for name, values, floor in columns:
             values = values.double()
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0, correction=0).clamp(min=floor))

@@ -120,9 +120,10 @@ class Windows:
         self._crop_episodes()
         self.arrays: dict[str, np.ndarray | Tensor] = {
             "state": self.frames["state"],
-            "environment_state": self.frames["environment_state"],
             "target": self.targets,
         }
+        if config.use_spatial_context:
+            self.arrays["environment_state"] = self.frames["environment_state"]
         self.since_command = config.since_command
         if self.counts is not None:
             self.arrays["counts"] = self.counts
@@ -211,12 +212,12 @@ class Windows:
             index: (B,) absolute frame numbers.
 
         Returns:
-            State (B, n, 15), environment_state (B, n, 24), target (B, n, 7) and, with `use_images`, static and gripper
-            (B, n, D), all float32; with `finetune_clip` static and gripper are instead the pictures of the steps that
-            are not padding, (N, H, W, 3) uint8; with `since_command` start (B, 1, 24), the environment state when the
-            command began; counts (B, n) float32, 1 where the demonstrator acted, unless it always did; valid_steps
-            (N,) int64, which of the B * n steps are not padding. Padding repeats the window's last step. On the GPU if
-            the frames fit there.
+            State (B, n, 15), target (B, n, 7), with `use_spatial_context` environment_state (B, n, 24) and, with
+            `use_images`, static and gripper (B, n, D), all float32; with `finetune_clip` static and gripper are instead
+            the pictures of the steps that are not padding, (N, H, W, 3) uint8; with `since_command` start (B, 1, 24),
+            the environment state when the command began; counts (B, n) float32, 1 where the demonstrator acted, unless
+            it always did; valid_steps (N,) int64, which of the B * n steps are not padding. Padding repeats the
+            window's last step. On the GPU if the frames fit there.
         """
         start, end = self.bounds(index)
         longest = self.length if self.pad_fully else (end - start).max()

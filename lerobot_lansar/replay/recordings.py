@@ -15,7 +15,7 @@ from dataset_convert.calvin import CalvinSplit
 from dataset_convert.frames import VECTORS
 from lerobot_lansar.datasets import MANIFEST, find_dataset
 
-from ..calvin import ACTION_NAMES, CAMERAS, SCENE_NAMES, TASKS
+from ..calvin import ACTION_NAMES, CAMERAS, SCENE_NAMES, SCENE_OBS_NAMES, TASKS
 from ..command import CommandError
 
 _STATE, _SCENE_STATE = "observation.state", "observation.environment_state"
@@ -93,9 +93,11 @@ class DatasetSource:
         features = self._meta.features
         names = {key: tuple(features.get(key, {}).get("names") or ()) for key in (_STATE, _SCENE_STATE, "action")}
         modes = [mode for mode, wanted in ACTION_NAMES.items() if names["action"] == wanted]
-        if len(names[_STATE]) != 15 or len(names[_SCENE_STATE]) < 24 or not modes:
+        scene = names[_SCENE_STATE][: len(SCENE_OBS_NAMES)]
+        if len(names[_STATE]) != 15 or scene != SCENE_OBS_NAMES or not modes:
             raise CommandError(
-                f"{self._root}: a replay needs {_STATE}, {_SCENE_STATE} and action as lansar-convert writes them"
+                f"{self._root}: a replay needs {_STATE}, {_SCENE_STATE} and action as lansar-convert writes them "
+                "(not with --scene_state=false)"
             )
         (self.control_mode,) = modes
         self._vectors = [_STATE, _SCENE_STATE, "action"]

@@ -4,9 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ..calvin import SCENE_OBS_NAMES, TASKS
 from ..command import CommandError
 from ..datasets import MANIFEST, dataset_folder
-from .published import GRIPPER, ROBOT, SCENE, STATIC
+from .published import GRIPPER, ROBOT, SCENE, STATIC, TASK
 
 LOOK = ("renderer", "assets", "image_size")
 """What decides how the desk looks in a policy's pictures; entries of an episode's line and of a manifest's `look`."""
@@ -43,7 +44,13 @@ class Policy:
     def reads_scene_state(self) -> bool:
         """Whether it reads the simulator's own state."""
         # LanSAR may ignore the scene state although its inputs include it.
-        return self._config.get("use_spatial_context", True) and "observation.environment_state" in self._inputs
+        reads = self._config.get("use_spatial_context", True) and "observation.environment_state" in self._inputs
+        return reads and self._environment_state_size != len(TASKS)
+
+    @property
+    def _environment_state_size(self) -> int | None:
+        """How many numbers of `environment_state` it reads; None: unknown, or none."""
+        return next(iter(self._inputs.get("observation.environment_state", {}).get("shape") or []), None)
 
     @property
     def reads(self) -> list[str]:
@@ -56,7 +63,8 @@ class Policy:
             found = [words for words, camera in cameras.items() if any(camera in key for key in pictures)]
             found = found or (["pictures"] if pictures else [])
         state = [ROBOT] if "observation.state" in self._inputs else []
-        return [*found, *state, *([SCENE] if self.reads_scene_state else [])]
+        task = [TASK] if self._environment_state_size in (len(TASKS), len(SCENE_OBS_NAMES) + len(TASKS)) else []
+        return [*found, *state, *([SCENE] if self.reads_scene_state else []), *task]
 
     @property
     def action_steps(self) -> int:

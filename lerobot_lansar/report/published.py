@@ -6,7 +6,7 @@ All are over the 1000 chains of the long-horizon benchmark.
 from dataclasses import dataclass, field
 
 STATIC, GRIPPER = "static picture", "gripper picture"
-ROBOT, SCENE = "robot state", "scene state (privileged)"
+ROBOT, SCENE, TASK = "robot state", "scene state (privileged)", "commanded task (34 numbers)"
 """What policies read. The scene state is the simulator's own, which a real robot does not have."""
 
 

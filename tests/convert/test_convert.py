@@ -108,6 +108,22 @@ def test_the_commanded_task_is_told_in_the_state_on_request(calvin, tmp_path):
         convert.convert(options(calvin, tmp_path / "out", mode="play"))
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_the_scenes_state_is_left_out_on_request(calvin, tmp_path, told):
+    out = convert.convert(options(calvin, tmp_path / "out", scene_state=False, task_in_state=told))
+    features, card = load(out).meta.features, (out / "README.md").read_text()
+    assert "**Privileged state:** none" in card
+    assert "--env.scene_state=false" in card
+    assert ("--policy.type=act" in card) == told
+    assert ("`--policy.use_spatial_context=false`" in card) == (not told)
+    assert ("`observation.environment_state` |" in card) == told
+    if told:
+        assert features["observation.environment_state"]["names"] == [f"task_{task}" for task in TASKS]
+        assert (np.stack(load(out).hf_dataset["observation.environment_state"]).sum(axis=1) == 1).all()
+    else:
+        assert "observation.environment_state" not in features
+
+
 def test_a_task_that_calvin_does_not_know_cannot_be_told_in_the_state(tmp_path):
     calvin = write_calvin(tmp_path / "calvin")
     index = calvin.root / "training/lang_annotations/auto_lang_ann.npy"

@@ -359,6 +359,7 @@ def test_random_folders_convert_exactly(tmp_path, seed):
         "mode": str(rng.choice(["windows", "play"])),
         "images": str(rng.choice(["video", "png"])),
         "action": str(rng.choice(["rel", "abs"])),
+        "scene_state": bool(rng.integers(2)),
         "task_in_state": bool(rng.integers(2)),
     }
     if changes["mode"] == "windows":

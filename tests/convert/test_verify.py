@@ -33,8 +33,9 @@ from lerobot_lansar.clip.store import sha256
         ({"images": "png", "tactile": True}, 4, 48, 0, 6),
         ({"images": "video", "depth": True, "tactile": True}, 4, 48, 6, 2),
         ({"images": "video", "mode": "play", "task_in_state": True}, 1, 39, 2, 0),
+        ({"images": "none", "scene_state": False, "task_in_state": True}, 4, 48, 0, 0),
     ],
-    ids=["numbers", "two workers", "png and touch", "video, depth and touch", "play"],
+    ids=["numbers", "two workers", "png and touch", "video, depth and touch", "play", "only the task"],
 )
 def test_a_fresh_dataset_equals_its_source(tmp_path, options, episodes, frames, videos, exact):
     arrays = {key: options.get(key, False) for key in ("depth", "tactile")}

@@ -233,6 +233,7 @@ def test_a_policy_that_needs_something_else_is_refused_with_the_option_to_set(ac
         ({"env": env}, r"--cameras='\[static\]'"),
         ({"env": env, "cameras": ["static"]}, "set --image_size=64"),
         ({"cameras": ["static"], "image_size": 64}, "set --env.task_in_state=true"),
+        ({"env": replace(env, scene_state=False)}, "set --env.scene_state=true"),
     ):
         with pytest.raises(CommandError, match=message):
             record(options(tmp_path / "desk", act, **changes))

@@ -62,6 +62,21 @@ def test_seed_chooses_the_chain_and_reset_without_seed_does_not_count_chains():
     env.close()
 
 
+@pytest.mark.parametrize("scene", [True, False])
+@pytest.mark.parametrize("told", [True, False])
+def test_the_environment_state_holds_what_was_asked_for(scene, told):
+    env = CalvinEnv("turn_on_led", cameras=(), scene_state=scene, task_in_state=told)
+    obs, _ = env.reset(seed=0)
+    for _ in range(2):
+        assert env.observation_space.contains(obs)
+        expected = [env._last["scene_obs"]] * scene + [[float(task == "turn_on_led") for task in TASKS]] * told
+        assert ("environment_state" in obs) == bool(expected)
+        if expected:
+            np.testing.assert_array_equal(obs["environment_state"], np.concatenate(expected))
+        obs = env.step(np.array([0, 0, 0.5, 0, 0, 0, 1]))[0]
+    env.close()
+
+
 def test_a_chain_rewards_each_fulfilled_command_and_changes_the_sentence(tmp_path):
     # the first chain that starts with two tasks that the demonstrator knows
     chain, tasks = next(

@@ -4,12 +4,13 @@ import inspect
 import io
 import json
 import sys
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 
 import draccus
 import numpy as np
 import pytest
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -24,6 +25,7 @@ from lerobot_lansar.desk.sentences import COMMANDS
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.envs.suites import suites
+from lerobot_lansar.policy.configuration_lansar import LanSARConfig
 
 
 def test_is_registered_under_its_name():
@@ -38,8 +40,9 @@ def test_features_follow_the_cameras():
         "observation.environment_state": (24,),
         "observation.images.gripper": (3, 84, 84),
     }
-    told = env_to_policy_features(CalvinEnvConfig(task_in_state=True))
-    assert told["observation.environment_state"].shape == (58,)
+    for scene, task, size in ((True, True, 58), (False, True, 34), (False, False, None)):
+        told = env_to_policy_features(CalvinEnvConfig(scene_state=scene, task_in_state=task))
+        assert getattr(told.get("observation.environment_state"), "shape", None) == (size and (size,))
     with pytest.raises(CommandError, match=r"--env\.cameras: 'wrist'"):
         CalvinEnvConfig(cameras=["wrist"])
 
@@ -99,25 +102,45 @@ def act(folder, size):
     return f"--policy.path={folder}"
 
 
-@pytest.mark.parametrize(("trained", "told"), [(58, "true"), (24, "false")])
-def test_a_forgotten_task_in_state_is_named_before_the_first_step(tmp_path, monkeypatch, trained, told):
-    wrong = CalvinEnvConfig(task_in_state=told == "false")
-    right = CalvinEnvConfig(task_in_state=told == "true")
+@pytest.mark.parametrize(
+    ("trained", "right", "wrong", "option"),
+    [
+        (58, {"task_in_state": True}, {}, "--env.task_in_state=true"),
+        (24, {}, {"task_in_state": True}, "--env.task_in_state=false"),
+        (24, {}, {"scene_state": False}, "--env.scene_state=true"),
+        (34, {"scene_state": False, "task_in_state": True}, {}, "--env.scene_state=false --env.task_in_state=true"),
+    ],
+)
+def test_a_forgotten_part_of_the_environment_state_is_named_before_the_first_step(
+    tmp_path, monkeypatch, trained, right, wrong, option
+):
     dataset = tmp_path / "dataset" / "meta" / "info.json"
     dataset.parent.mkdir(parents=True)
     dataset.write_text(json.dumps({"features": {"observation.environment_state": {"shape": [trained]}}}))
     trains = ["--policy.type=act", "--dataset.repo_id=you/desk", f"--dataset.root={tmp_path / 'dataset'}"]
     for arguments in ([act(tmp_path, trained)], trains):
         monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments])
-        right.get_env_processors()
-        with pytest.raises(CommandError, match=f"trained on {trained} numbers .*set --env.task_in_state={told}"):
-            wrong.get_env_processors()
+        CalvinEnvConfig(**right).get_env_processors()
+        with pytest.raises(CommandError, match=f"trained on {trained} numbers .*set {option}$"):
+            CalvinEnvConfig(**wrong).get_env_processors()
 
 
 def test_a_policy_that_reads_no_environment_state_may_have_any(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", act(tmp_path, None)])
     for told in (True, False):
-        CalvinEnvConfig(task_in_state=told).get_env_processors()
+        CalvinEnvConfig(scene_state=told, task_in_state=told).get_env_processors()
+
+
+def test_a_lansar_that_does_not_look_at_the_scene_may_have_it_or_not(tmp_path, monkeypatch):
+    features = {"observation.environment_state": PolicyFeature(FeatureType.ENV, (24,))}
+    for looks in (False, True):
+        config = LanSARConfig(device="cpu", use_spatial_context=looks, input_features=dict(features))
+        config._save_pretrained(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path}"])
+        CalvinEnvConfig().get_env_processors()
+        refused = pytest.raises(CommandError, match=r"set --env\.scene_state=true") if looks else nullcontext()
+        with refused:
+            CalvinEnvConfig(scene_state=False).get_env_processors()
 
 
 def test_recording_is_refused_where_lerobot_would_mix_up_sentences(monkeypatch):

@@ -15,7 +15,9 @@ from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.model import Clip
 from lerobot_lansar.clip.store import dataset_fingerprint
 from lerobot_lansar.policy import frames as frames_module
+from lerobot_lansar.policy import make_lansar_pre_post_processors
 from lerobot_lansar.policy.frames import CACHE, load_frames
+from lerobot_lansar.policy.modeling_lansar import LanSARPolicy
 from lerobot_lansar.policy.scaling import INPUT_FLOOR, Scaler
 from lerobot_lansar.policy.windows import Windows, action_form
 
@@ -163,6 +165,45 @@ def test_frame_arrays_are_kept_and_made_again_when_the_data_changes(tmp_path, mo
         "meta",
         ".cache",
     }  # nothing half-written left
+
+
+@pytest.mark.parametrize("width", [None, 34])
+def test_without_the_scenes_state_windows_have_none(tmp_path, width):
+    make_dataset(tmp_path / "data", lengths=(9, 12))
+    for file in (tmp_path / "data/data").rglob("*.parquet"):
+        table = pq.read_table(file)
+        place = table.column_names.index("observation.environment_state")
+        table = table.drop_columns("observation.environment_state")
+        if width:
+            told = pa.array([[1.0] * width] * len(table), pa.list_(pa.float32(), width))
+            table = table.add_column(place, "observation.environment_state", told)
+        pq.write_table(table, file)
+    info = tmp_path / "data/meta/info.json"
+    told = json.loads(info.read_text())
+    del told["features"]["observation.environment_state"]
+    info.write_text(json.dumps(told))
+    for _ in range(2):  # from the files, from the cache
+        assert "environment_state" not in load_frames(tmp_path / "data")
+    config = small_config(use_images=True, use_spatial_context=False)
+    add_embeddings(tmp_path / "data", Clip(config.clip))
+    policy = LanSARPolicy(config, dataset_meta=dataset_meta(tmp_path / "data"))
+    batch = make_lansar_pre_post_processors(config)[0](
+        {
+            "index": torch.tensor([0, 4]),
+            "task": ["open the drawer"] * 2,
+            "observation.environment_state": torch.zeros(2, 24),
+        }
+    )
+    assert "observation.environment_state" not in batch, "a single frame's"
+    policy.forward(batch)[0].backward()
+    one = {"observation.state": torch.zeros(1, 15), "task": ["go"]}
+    one |= {
+        f"observation.clip.{name}": torch.zeros(1, config.network.clip_dim) for name in ("command", "static", "gripper")
+    }
+    assert policy.select_action(one).isfinite().all()
+    seeing = LanSARPolicy(small_config())
+    with pytest.raises(ValueError, match=r"set --env\.scene_state=true"):
+        seeing.select_action(one)
 
 
 def test_a_folder_that_cannot_be_written_to_is_read_into_memory(tmp_path, monkeypatch, relative):

@@ -62,8 +62,10 @@ def write_plan(folder, **entries):
 
 
 def write_policy(folder, *features, **options):
-    """Writes the config.json of a policy that reads these features."""
+    """Writes the config.json of a policy that reads these features, such as `state` or `environment_state 58`."""
     folder.mkdir(parents=True, exist_ok=True)
-    inputs = {f"observation.{name}": {} for name in features}
+    inputs = {
+        f"observation.{name}": {"shape": [int(size or 24)]} for name, _, size in (f.partition(" ") for f in features)
+    }
     (folder / "config.json").write_text(json.dumps({"input_features": inputs, **options}))
     return str(folder)

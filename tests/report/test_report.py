@@ -172,6 +172,8 @@ def test_another_protocol_than_calvins_is_stated(tmp_path, settings, note):
         (["state", "images.static"], {}, ["static picture", "robot state"]),
         (["images.static", "images.gripper"], {}, ["static picture", "gripper picture"]),
         (["environment_state"], {"use_spatial_context": False}, []),
+        (["environment_state 58"], {}, ["scene state (privileged)", "commanded task (34 numbers)"]),
+        (["state", "environment_state 34"], {}, ["robot state", "commanded task (34 numbers)"]),
         (
             ["state", "environment_state"],
             {"use_images": True, "use_spatial_context": True},
