@@ -65,7 +65,7 @@ def interrupt(desk: Desk, task: str, rng: np.random.Generator) -> Interruption:
         for after in _disturb(desk, task, now, disturbance, rng):
             before, now = now, after
         if not is_fulfilled(task, begun, desk.snapshot()):
-            feasible = _is_feasible(TASKS[task], _view(desk, start), _view(desk, now), begun)
+            feasible = _can_still_be_done(TASKS[task], _view(desk, start), _view(desk, now), begun)
             return Interruption(start, before, now, begun, feasible, disturbance)
 
 
@@ -105,7 +105,7 @@ def _view(desk: Desk, obs: Observation) -> View:
     return View(desk.scene, obs["robot_obs"], obs["scene_obs"], np.random.default_rng(0))
 
 
-def _is_feasible(task: Task, start: View, now: View, begun: Snapshot) -> bool:
+def _can_still_be_done(task: Task, start: View, now: View, begun: Snapshot) -> bool:
     """Whether `task` can still be done, by the rules for start states in docs/demonstrations.md."""
     held = start.held()
     color = task.color or held
