@@ -135,10 +135,8 @@ def _features(info: dict[str, Any], request: dict[str, Any]) -> str:
         shape = "×".join(str(size) for size in feature["shape"])
         text = _ACTION[request["action"]] if key == "action" else _MEANING.get(key, "fingertip sensor")
         if key == "observation.environment_state":
-            parts = ([_SCENE] if request.get("scene_state", True) else []) + (
-                [_TASK] if request.get("task_in_state") else []
-            )
-            text = "; then ".join(parts)
+            has = {_SCENE: request.get("scene_state", True), _TASK: request.get("task_in_state", False)}
+            text = "; then ".join(part for part, there in has.items() if there)
         rows.append(f"| `{key}` | {shape} | {feature['dtype']} | {text} |")
     return "\n".join(rows)
 

@@ -91,9 +91,9 @@ def _read_file(path: Path) -> dict[str, np.ndarray]:
     frames = {name: table[name].to_numpy() for name in NUMBERS}
     for name, (column, width) in columns.items():
         values = np.concatenate([chunk.flatten().to_numpy() for chunk in table[column].chunks])
-        if len(values) != width * len(table) and name in SCENE:
-            continue
         if len(values) != width * len(table):
+            if name in SCENE:
+                continue
             raise ValueError(f"{path}: {column} must hold {width} numbers per frame.")
         values = values.reshape(-1, width).astype(np.float32)
         if not np.isfinite(values).all():
