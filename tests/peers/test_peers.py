@@ -43,15 +43,17 @@ def observation(*commands, seed=1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "updates"), [("mcil", 800), ("hulc", 600), ("gr1", 100)])
-def test_it_learns_32_demonstrations_by_heart(kind, updates, datasets):
+@pytest.mark.parametrize(("kind", "updates", "rate"), [("mcil", 400, 5e-3), ("hulc", 600, 1e-3), ("gr1", 100, 2e-3)])
+def test_it_learns_32_demonstrations_by_heart(kind, updates, rate, datasets):
     options = {"window": 4, "image_size": 32, "dropout": 0.0} if kind == "gr1" else {"window": 4, "min_window": 4}
     if kind == "hulc":
         options["recognition_dropout"] = 0.0
     meta = LeRobotDatasetMetadata("test/squares", root=datasets[FORMS[kind]])
     policy, prepare, _ = make(kind, dataset_meta=meta, static_shift=0, gripper_shift=0, **options)
     batch = prepare(windows(kind, policy, datasets, range(0, 32 * LENGTH, LENGTH)))
-    optimizer = torch.optim.Adam(policy.get_optim_params(), lr=2e-3)
+    optimizer = torch.optim.Adam(policy.get_optim_params(), lr=rate)
+    # MCIL swings about a loss of 7 at any constant rate; HULC learns what a plan means late, and before the rate falls.
+    falling = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=updates) if kind == "mcil" else None
     losses = []
     for _ in range(updates):
         loss, _ = policy.train().forward(batch)
@@ -59,6 +61,8 @@ def test_it_learns_32_demonstrations_by_heart(kind, updates, datasets):
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
         optimizer.step()
+        if falling:
+            falling.step()
         losses.append(loss.item())
     arm, gripper, target = predicted(kind, policy.eval(), batch)
     error = (arm - target[..., :6])[..., :2].abs().mean()  # the hand moves in x and y only
