@@ -7,8 +7,8 @@ from pathlib import Path
 
 from .command import CommandError, run_command
 
-FOLDERS = ("configs",)
-"""Folders at the repository's top that are shipped; a wheel carries them inside `lerobot_lansar`."""
+CONFIGS = "configs"
+"""The folder of configuration files, at the repository's top; a wheel carries it inside `lerobot_lansar`."""
 
 CHECKPOINTS = "checkpoints"
 """The folder in `lerobot_lansar` that holds trained policies."""
@@ -21,9 +21,9 @@ def shipped() -> dict[str, Path]:
     such as `checkpoints/desk-d`.
     """
     package = Path(__file__).parent
-    top = package if (package / FOLDERS[0]).is_dir() else package.parent
+    top = package if (package / CONFIGS).is_dir() else package.parent
     checkpoints = sorted(file.parent for file in (package / CHECKPOINTS).glob("*/config.json"))
-    files = sorted(file for folder in FOLDERS for file in (top / folder).rglob("*.yaml"))
+    files = sorted((top / CONFIGS).rglob("*.yaml"))
     named = {f"{CHECKPOINTS}/{folder.name}": folder for folder in checkpoints}
     return named | {file.relative_to(top).as_posix().removesuffix(".yaml"): file for file in files}
 

@@ -83,9 +83,8 @@ def test_an_unknown_shipped_name_is_answered_with_similar_ones():
 
 def test_a_wheel_carries_what_lansar_path_finds_and_finds_it_there(tmp_path, monkeypatch):
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    for folder in paths.FOLDERS:
-        assert folder in wheel["only-include"]
-        assert wheel["sources"][folder] == f"lerobot_lansar/{folder}"
+    assert paths.CONFIGS in wheel["only-include"]
+    assert wheel["sources"] == {paths.CONFIGS: f"lerobot_lansar/{paths.CONFIGS}"}
     (tmp_path / "lerobot_lansar/configs/thesis").mkdir(parents=True)
     file = tmp_path / "lerobot_lansar/configs/thesis/mine.yaml"
     file.touch()
