@@ -8,6 +8,9 @@ r"""Which of LanSAR's options help: same demonstrations and updates, several see
     python benchmarks/ablations.py --root=data/chains_lerobot [--variants='[recommended,euler angles]']
         [--seeds='[0,1,2]'] [--updates=3000] [--chains=100] [--workers=2] [--output_dir=outputs/ablations]
 
+The thesis' rows with pictures (`PICTURES` below) need recordings with cameras, converted with
+`--images=none --embed=true --clip.model=lansar-desk --clip.pretrained=v1`.
+
 Every run is `lerobot-train` on --config with one change, then `lansar-eval` on the benchmark's first chains, built-in
 desk, with sentences that no demonstration was labelled with. Runs that are in --output_dir already are not repeated.
 Prints a Markdown table and writes its numbers to --output_dir/results.json. The difference to the first variant is of
@@ -60,20 +63,30 @@ THESIS = [
 ]
 """The options of configs/thesis/baseline.yaml except sizes and optimizer, with as many steps per update; without
 pictures."""
+SEEING = ["--policy.use_images=true"]
+ALONE = ["--policy.use_spatial_context=false"]
+PREPENDED = ["--policy.command_prepended=true"]
+PICTURES: dict[str, tuple[list[str], list[str]]] = {
+    "pictures and state (Baseline)": (SEEING, []),
+    "pictures and state, command prepended (Prepend)": ([*SEEING, *PREPENDED], []),
+    "pictures alone (No Space)": ([*SEEING, *ALONE], []),
+    "thesis (Baseline) at this size": ([*THESIS, *SEEING], [*THESIS_RULES, *SLIDE]),
+    "thesis (Prepend) at this size": ([*THESIS, *SEEING, *PREPENDED], [*THESIS_RULES, *SLIDE]),
+    "thesis (No Space) at this size": ([*THESIS, *SEEING, *ALONE], [*THESIS_RULES, *SLIDE]),
+}
+"""Table 5.3's variants that see, by the recommended and by the thesis' choices; the fourth, No Image, are "recommended"
+and "thesis (No Image) at this size"."""
 VARIANTS: dict[str, tuple[list[str], list[str]]] = {
     "recommended": ([], []),
     "thesis (No Image) at this size": (THESIS, [*THESIS_RULES, *SLIDE]),
-    "thesis (No Image) at this size, Prepend": (
-        [*THESIS, "--policy.command_prepended=true"],
-        [*THESIS_RULES, *SLIDE],
-    ),
+    "thesis (No Image) at this size, Prepend": ([*THESIS, *PREPENDED], [*THESIS_RULES, *SLIDE]),
     "achieved targets, thesis constants": (ACHIEVED, THESIS_RULES),
     "achieved targets, as predicted": (ACHIEVED, []),
     "euler angles": (["--policy.orientation=euler"], []),
     "BatchNorm in the MLPs": (["--policy.mlp_norm=batch"], []),
     "blocks not seen from the hand": (["--policy.egocentric_blocks=false"], []),
     "command not in the context": (["--policy.command_in_context=false"], []),
-    "command prepended": (["--policy.command_prepended=true"], []),
+    "command prepended": (PREPENDED, []),
     "windows from the episode's start": (["--policy.window_start=episode"], []),
     "windows from anywhere": (["--policy.window_start=anywhere"], []),
     "contrastive loss, weight 0.1": (["--policy.contrastive_weight=0.1"], []),
@@ -163,7 +176,7 @@ def train(options: Options, changes: list[str], seed: int) -> tuple[Path, float]
 
 def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
     """One training and its evaluation; parts that exist already are not repeated."""
-    training, evaluation = VARIANTS[variant]
+    training, evaluation = (VARIANTS | PICTURES)[variant]
     checkpoint, minutes = train(options, training, seed)
     folder = checkpoint.parents[3] / key(evaluation, options.chains)
     if not (folder / "report.json").exists():
@@ -173,7 +186,7 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
             f"--policy.path={checkpoint}",
             "--env.type=calvin",
             "--env.control_mode=abs",
-            "--env.cameras=[]",
+            *(["--env.cameras=[]"] if variant in VARIANTS else []),
             *evaluation,
             f"--chains={options.chains}",
             "--workers=1",
@@ -201,9 +214,9 @@ def to_first(runs: list[dict[str, Any]], first: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Runs what is missing and prints the table."""
     options = draccus.parse(Options)
-    unknown = set(options.variants) - VARIANTS.keys()
-    if unknown:
-        sys.exit(f"--variants: unknown {sorted(unknown)}; choose among {list(VARIANTS)}")
+    known = VARIANTS | PICTURES
+    if unknown := set(options.variants) - known.keys():
+        sys.exit(f"--variants: unknown {sorted(unknown)}; choose among {list(known)}")
     runs = [(variant, seed) for seed in options.seeds for variant in options.variants]
     with ThreadPoolExecutor(options.workers) as pool:
         done = list(tqdm(pool.map(lambda run: measure(options, *run), runs), total=len(runs), unit="run"))
