@@ -33,7 +33,7 @@ demo: install
 	@echo "the page, with all videos, to open in a browser: outputs/demo/report.html"
 
 test: install
-	@.venv/bin/python -m pytest -n auto --maxprocesses 8 --dist loadfile
+	@.venv/bin/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations=25
 
 lint: install
 	.venv/bin/ruff check .
