@@ -1,32 +1,39 @@
 """Trains lansar-desk, the small CLIP that comes with the package, on pictures of the desks and on commands.
 
-    python scripts/train_clip.py record --assets=CALVIN_ENV/data    # moments of play on all four desks
-    python scripts/train_clip.py train                              # both towers; writes the weights into the package
+    python scripts/train_clip.py record --assets=CALVIN_ENV/data    # pictures of all four desks
+    python scripts/train_clip.py train                              # writes the weights into the package
     python scripts/train_clip.py judge --sentences='[FILE.yaml]'    # what it understands and sees, on held-out data
 
-Three losses, summed:
+Four losses, summed:
 
     pictures and captions   open_clip's own contrastive loss; captions say what is where (`caption`)
     commands                the same loss between two sentences for each of the 34 tasks (clip_grammar.yaml)
     states                  a linear head on the picture's embedding predicts what the caption says in numbers (smooth
                             L1); it is dropped afterwards, and makes that linear policies find the state
+    places                  the first four features of the image encoder lie where the picture shows the three blocks
+                            and the TCP (cross-entropy over the cells), which teaches it to look far sooner
 
-`record` continues an interrupted recording; one round of all desks and assets in ten is held out.
+With --text=FILE the text encoder is that file's and stays as it is, so sentences keep their embeddings, and policies
+that were trained on them can go on. `record` continues an interrupted recording; one round of all desks and assets in
+ten is held out.
 """
 
 import itertools
 import multiprocessing
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import draccus
 import numpy as np
 import torch
 import torch.nn.functional as F
 import yaml
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from lerobot_lansar.calvin import (
@@ -43,7 +50,7 @@ from lerobot_lansar.calvin import (
     Task,
     block_pose,
 )
-from lerobot_lansar.cameras import gripper_camera_pose
+from lerobot_lansar.cameras import gripper_camera_pose, intrinsics, static_camera_pose
 from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.model import CLIP_MODELS, Clip
 from lerobot_lansar.demos.demonstrator import carry_out
@@ -78,6 +85,7 @@ class Options:
     assets: str | None = None
     # Sessions of 400 moments, two pictures each; the four desks in turn.
     sessions: int = 120
+    # Processes that record, or that prepare batches beside the one that trains.
     workers: int = 2
     # Updates.
     steps: int = 3000
@@ -86,6 +94,8 @@ class Options:
     learning_rate: float = 1e-3
     seed: int = 0
     device: str = "cpu"
+    # A weights file whose text encoder is kept. None: both encoders are trained.
+    text: Path | None = None
     # YAML files of sentences by task (CALVIN's form) that `judge` assigns to tasks.
     sentences: list[Path] = field(default_factory=list)
     # Where `train` writes the weights, and `judge` reads them.
@@ -96,7 +106,7 @@ class Options:
 
 
 def record(options: Options) -> None:
-    """Plays on all desks and keeps a moment every few steps: pictures as the CLIP sees them, states, places."""
+    """Keeps pictures as the CLIP sees them, states and places: half of the rounds of play, half of random states."""
     options.root.mkdir(parents=True, exist_ok=True)
     jobs = [(number, options) for number in range(options.sessions) if not _session(options, number).exists()]
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
@@ -117,7 +127,8 @@ def _record_session(job: tuple[int, Options]) -> None:
     clip = Clip(ClipConfig(MODEL, ""))
     rows: dict[str, list[np.ndarray]] = {}
     with Desk(scene, assets, cameras=()) as desk:
-        for obs, snapshot in itertools.islice(_play(desk, rng), MOMENTS):
+        moments = _scattered(desk, rng) if number // ROUND % 2 else _play(desk, rng)
+        for obs, snapshot in itertools.islice(moments, MOMENTS):
             row = {
                 **{camera: _as_seen(clip, desk.render(camera)) for camera in CAMERAS},
                 "robot_obs": obs["robot_obs"],
@@ -157,6 +168,23 @@ def _play(desk: Desk, rng: np.random.Generator):
                     done = done + 1 if is_fulfilled(before, start, last) else 0
                     if done > 2:
                         break
+        except SimulationError:
+            continue
+
+
+def _scattered(desk: Desk, rng: np.random.Generator):
+    """Random states, each also with the hand near two of its blocks. In play, blocks lie where they are for long."""
+    while True:
+        try:
+            robot, scene = sample_start(desk, str(rng.choice(list(TASKS))), rng)
+            yield desk.reset(robot, scene), desk.snapshot()
+            for k in rng.permutation(len(COLORS))[:2]:
+                position = scene[block_pose(k)][:3] + rng.normal(0, 0.04, 3) + [0, 0, 0.08]
+                euler = np.array([np.pi, 0, 0]) + rng.normal(0, 0.1, 3) + [0, 0, np.pi / 2 + rng.uniform(-0.8, 0.8)]
+                joints = desk.solve_ik(position, euler)
+                obs = desk.reset(np.array([*position, *euler, robot[GRIPPER_WIDTH], *joints, robot[-1]]), scene)
+                if np.linalg.norm(obs["robot_obs"][:3] - position) < 0.02:
+                    yield obs, desk.snapshot()
         except SimulationError:
             continue
 
@@ -238,6 +266,21 @@ def numbers(moment: dict[str, np.ndarray], camera: str) -> tuple[np.ndarray, np.
     return np.array([*robot[:3], *ways.ravel(), robot[GRIPPER_WIDTH], 0.0, 0.0, 0.0]), shown
 
 
+def pixels(moment: dict[str, np.ndarray], camera: str, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where a camera's picture of `size` pixels shows the blocks and the TCP.
+
+    Returns:
+        Column and row of each, (4, 2), and which of them lie in the picture, (4,); some of these may be hidden.
+    """
+    robot, scene = moment["robot_obs"], moment["scene_obs"]
+    points = np.stack([*(scene[block_pose(k)][:3] for k in range(len(COLORS))), robot[:3]])
+    pose = np.linalg.inv(static_camera_pose() if camera == "static" else gripper_camera_pose(robot))
+    seen = points @ pose[:3, :3].T + pose[:3, 3]
+    found = seen @ intrinsics(camera, size).T
+    found = found[:, :2] / np.maximum(found[:, 2:], 1e-6)
+    return found, (seen[:, 2] > 0.01) & (found >= 0).all(axis=1) & (found <= size - 1).all(axis=1)
+
+
 UNITS = {
     "static": np.array([0.2, 0.15, 0.08] + [0.2, 0.15, 0.08] * 3 + [0.1, 0.08, 0.5, 0.5]),
     "gripper": np.array([0.2, 0.15, 0.08] + [0.04] * 9 + [0.03, 1.0, 1.0, 1.0]),
@@ -251,22 +294,22 @@ UNITS = {
 class Commands:
     """Draws sentences for each task from the grammar, but none of those that are held out."""
 
-    def __init__(self, rng: np.random.Generator):
+    def __init__(self) -> None:
         grammar = yaml.safe_load(GRAMMAR.read_text())
-        self._words, self._tasks, self._rng = grammar["words"], grammar["tasks"], rng
+        self._words, self._tasks = grammar["words"], grammar["tasks"]
         self._held_out = {sentence for sentences in COMMANDS["validation"].values() for sentence in sentences}
 
-    def draw(self, task: Task) -> str:
+    def draw(self, task: Task, rng: np.random.Generator) -> str:
         """A random sentence: of the grammar, or now and then one of the task's own training sentences."""
-        if self._rng.uniform() < 0.15:
-            return str(self._rng.choice(COMMANDS["training"][task.name]))
+        if rng.uniform() < 0.15:
+            return str(rng.choice(COMMANDS["training"][task.name]))
         patterns = self._tasks.get(task.name) or self._tasks.get(f"{task.kind}_{task.place}") or self._tasks[task.kind]
         while True:
-            sentence = self._fill(str(self._rng.choice(patterns)), task)
+            sentence = self._fill(str(rng.choice(patterns)), task, rng)
             if sentence not in self._held_out:
                 return sentence
 
-    def _fill(self, pattern: str, task: Task) -> str:
+    def _fill(self, pattern: str, task: Task, rng: np.random.Generator) -> str:
         for _ in range(3):  # words may hold words
             for name, choices in self._words.items():
                 while f"{{{name}}}" in pattern:
@@ -275,7 +318,7 @@ class Commands:
         while "(" in pattern:  # the innermost first
             end = pattern.index(")")
             begin = pattern.rindex("(", 0, end)
-            choice = str(self._rng.choice(pattern[begin + 1 : end].split("|")))
+            choice = str(rng.choice(pattern[begin + 1 : end].split("|")))
             pattern = pattern[:begin] + choice + pattern[end + 1 :]
         return " ".join(pattern.split())
 
@@ -307,74 +350,122 @@ class Data:
         return {key: self.arrays[key][index] for key in ("robot_obs", "scene_obs", "places", "scene")}
 
 
-def _augment(pictures: Tensor, generator: torch.Generator) -> Tensor:
+class Batches(Dataset):
+    """One batch of each camera per update. Each has a random generator of its own, so `workers` changes nothing.
+
+    A batch is {camera: tensors}, B of them: `pictures` (B, 3, S, S) uint8, their captions' `tokens` (B, L), the
+    `values` (B, 16) of their state in units and which are `shown` (B, 16), `where` the picture shows things (B, 4, 2)
+    in pixels and which are `visible` (B, 4); and {"commands": tokens (2, 34, L)}.
+    """
+
+    def __init__(self, data: Data, tokenizer: Any, options: Options) -> None:
+        self._data, self._tokenizer, self._options, self._commands = data, tokenizer, options, Commands()
+
+    def __len__(self) -> int:
+        return self._options.steps
+
+    def __getitem__(self, step: int) -> dict[str, Any]:
+        rng = np.random.default_rng([self._options.seed, step])
+        batch: dict[str, Any] = {camera: self._camera(camera, rng) for camera in UNITS}
+        sentences = [self._commands.draw(task, rng) for _ in range(2) for task in TASKS.values()]
+        batch["commands"] = self._tokenizer(sentences).unflatten(0, (2, -1))
+        return batch
+
+    def _camera(self, camera: str, rng: np.random.Generator) -> dict[str, Tensor]:
+        rows = np.sort(rng.choice(len(self._data), self._options.batch_size, replace=False))
+        pictures = torch.from_numpy(self._data.arrays[camera][rows]).permute(0, 3, 1, 2)
+        moments = [self._data.moment(row) for row in rows]
+        values, shown = _stacked(numbers(moment, camera) for moment in moments)
+        where, visible = _stacked(pixels(moment, camera, pictures.shape[-1]) for moment in moments)
+        return {
+            "pictures": pictures,
+            "tokens": self._tokenizer([caption(moment, camera, rng) for moment in moments]),
+            "values": (values - torch.from_numpy(CENTRES[camera])).div(torch.from_numpy(UNITS[camera])).float(),
+            "shown": shown.float(),
+            "where": where.float(),
+            "visible": visible.float(),
+        }
+
+
+def _stacked(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[Tensor, ...]:
+    return tuple(torch.from_numpy(np.stack(part)) for part in zip(*pairs, strict=True))
+
+
+def _augment(pictures: Tensor) -> Tensor:
     """Other saturation, contrast, light and tint, and noise: (B, 3, S, S) in [0, 1]."""
-    count = len(pictures)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(count, *shape, generator=generator)
+        return low + (high - low) * torch.rand(len(pictures), *shape, device=pictures.device)
 
     saturation, contrast = uniform(0.6, 1.4, 1, 1), uniform(0.7, 1.3, 1, 1)
-    mix = saturation * torch.eye(3) + (1 - saturation) / 3  # of the three colours, (B, 3, 3)
+    mix = saturation * torch.eye(3, device=pictures.device) + (1 - saturation) / 3  # of the colours, (B, 3, 3)
     tint, light = uniform(0.85, 1.15, 3, 1), uniform(-0.1, 0.1, 1, 1)
     offset = tint * (0.5 - 0.5 * contrast) + light
     mixed = torch.baddbmm(offset, tint * contrast * mix, pictures.flatten(2)).view_as(pictures)
-    noise = torch.randn(pictures.shape, generator=generator)
-    return mixed.add_(noise, alpha=0.02).clamp_(0, 1)
+    return mixed.add_(torch.randn_like(mixed), alpha=0.02).clamp_(0, 1)
+
+
+def _around(where: Tensor, cells: int) -> Tensor:
+    """Shares of a square's cells that lie about places (B, P, 2), column and row in cells: (B, P, cells * cells)."""
+    middles = torch.arange(cells, device=where.device)  # a cell's middle is that of the pixel where its strides begin
+    columns, rows = (torch.exp(-((where[..., None, k] - middles) ** 2) / (2 * 0.8**2)) for k in range(2))
+    shares = (rows[..., :, None] * columns[..., None, :]).flatten(2)
+    return shares / shares.sum(dim=-1, keepdim=True).clamp(min=1e-6)
 
 
 def train(options: Options) -> None:
-    """Trains both towers and writes the weights in float16."""
+    """Trains the encoders and writes the weights in float16."""
     from open_clip import ClipLoss
 
     torch.manual_seed(options.seed)
-    rng, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
-    data, commands = Data(options, held_out=False), Commands(rng)
+    data = Data(options, held_out=False)
     clip = Clip(ClipConfig(MODEL, ""), options.device)
     model = clip.model.train().requires_grad_(True)
+    if options.text:
+        kept = {n: v for n, v in load_file(options.text).items() if not n.startswith("visual.") and n != "logit_scale"}
+        model.load_state_dict(kept, strict=False)
+        for name, parameter in model.named_parameters():
+            parameter.requires_grad_(name not in kept)
     heads = nn.ModuleDict({camera: nn.Linear(clip.embed_dim, 16) for camera in UNITS}).to(options.device)
-    weights = [*model.parameters(), *heads.parameters()]
+    weights = [w for w in (*model.parameters(), *heads.parameters()) if w.requires_grad]
     optimizer = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.05, betas=(0.9, 0.98))
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.learning_rate, options.steps, pct_start=0.05)
-    contrast, tasks = ClipLoss(), list(TASKS.values())
+    contrast = ClipLoss()
+    encoder, scores = model.visual.trunk, {}
+    encoder.maps.register_forward_hook(lambda module, given, found: scores.update(last=found))
 
-    def see(pictures: Tensor) -> Tensor:
-        with torch.autocast(clip.device.type, torch.bfloat16):  # half the time on a CPU that has it
-            x = _augment(pictures, generator).to(clip.device, memory_format=torch.channels_last)
-            return model.encode_image(clip.images.normalize(x)).float()
+    def read(tokens: Tensor) -> Tensor:
+        return F.normalize(model.encode_text(tokens), dim=-1)
 
-    def read(texts: list[str]) -> Tensor:
-        return F.normalize(model.encode_text(clip.tokenizer(texts).to(clip.device)), dim=-1)
+    def losses(batch: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:
+        scale = model.logit_scale.exp().clamp(max=100)
+        for camera in UNITS:
+            of = batch[camera]
+            pictures = _augment(of["pictures"].float() / 255).contiguous(memory_format=torch.channels_last)
+            seen = model.encode_image(clip.images.normalize(pictures))
+            yield f"{camera} captions", contrast(F.normalize(seen, dim=-1), read(of["tokens"]), scale)
+            error = F.smooth_l1_loss(heads[camera](seen), of["values"], reduction="none", beta=0.1)
+            yield f"{camera} states", 3 * (error * of["shown"]).sum() / of["shown"].sum()
+            cells = scores["last"].shape[-1]
+            wanted = _around(of["where"] * cells / pictures.shape[-1], cells)
+            error = -(wanted * encoder.log_shares(scores["last"])[:, : wanted.shape[1]]).sum(dim=-1)
+            yield f"{camera} places", 0.3 * (error * of["visible"]).sum() / of["visible"].sum()
+        if not options.text:
+            yield "commands", contrast(*(read(tokens) for tokens in batch["commands"]), scale)
 
     means: dict[str, float] = {}
-    with tqdm(range(options.steps), unit="update") as bar:
-        for step in bar:
-            losses = {}
-            scale = model.logit_scale.exp().clamp(max=100)
-            for camera in UNITS:
-                rows = np.sort(rng.choice(len(data), options.batch_size, replace=False))
-                pictures = torch.from_numpy(data.arrays[camera][rows]).permute(0, 3, 1, 2).float() / 255
-                seen = see(pictures)
-                moments = [data.moment(row) for row in rows]
-                said = read([caption(m, camera, rng) for m in moments])
-                losses[f"{camera} captions"] = contrast(F.normalize(seen, dim=-1), said, scale)
-                values, shown = (np.stack(part) for part in zip(*(numbers(m, camera) for m in moments), strict=True))
-                values, shown = (
-                    torch.from_numpy(part).float().to(clip.device)
-                    for part in ((values - CENTRES[camera]) / UNITS[camera], shown)
-                )
-                error = F.smooth_l1_loss(heads[camera](seen), values, reduction="none", beta=0.1)
-                losses[f"{camera} states"] = 3 * (error * shown).sum() / shown.sum()
-            pairs = [read([commands.draw(task) for task in tasks]) for _ in range(2)]
-            losses["commands"] = contrast(*pairs, scale)
+    batches = DataLoader(Batches(data, clip.tokenizer, options), batch_size=None, num_workers=options.workers)
+    with tqdm(batches, unit="update") as bar:
+        for step, batch in enumerate(bar):
+            found = dict(losses(_to(batch, clip.device)))
             optimizer.zero_grad(set_to_none=True)
-            torch.stack(list(losses.values())).sum().backward()
+            torch.stack(list(found.values())).sum().backward()
             nn.utils.clip_grad_norm_(weights, 1.0)
             optimizer.step()
             schedule.step()
-            for name, loss in losses.items():
-                means[name] = 0.98 * means.get(name, loss.item()) + 0.02 * loss.item()
             if step % 20 == 0:
+                for name, loss in found.items():
+                    means[name] = 0.7 * means.get(name, loss.item()) + 0.3 * loss.item()
                 bar.set_postfix({name: f"{mean:.3f}" for name, mean in means.items()})
     state = {name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()}
     made = {name: str(getattr(options, name)) for name in ("steps", "batch_size", "learning_rate", "seed")}
@@ -383,6 +474,12 @@ def train(options: Options) -> None:
     save_file(state, partial, made)
     partial.rename(options.output)
     print(f"{options.output}: {options.output.stat().st_size / 1e6:.1f} MB; losses {means}")
+
+
+def _to(batch: Any, device: torch.device) -> Any:
+    if isinstance(batch, dict):
+        return {name: _to(part, device) for name, part in batch.items()}
+    return batch.to(device, non_blocking=True)
 
 
 CENTRES = {
@@ -425,7 +522,8 @@ def _judge_pictures(clip: Clip, options: Options) -> None:
     fitted, judged = Data(options, held_out=False), Data(options, held_out=True)
     few = np.random.default_rng(0).choice(len(fitted), min(len(fitted), 12_000), replace=False)
     print(
-        "\n| desk | camera | block position, median (mm) | drawer | slide | bulb | led |\n| --- | --- |" + " ---: |" * 5
+        "\n| desk | camera | block position, median (mm) | of those on the table | drawer | slide | bulb | led |\n"
+        "| --- | --- |" + " ---: |" * 6
     )
     for camera in UNITS:
         x, y = _embedded(clip, fitted, camera, few), _embedded(clip, judged, camera, np.arange(len(judged)))
@@ -437,7 +535,9 @@ def _judge_pictures(clip: Clip, options: Options) -> None:
         for scene, original in itertools.product(SCENE_NAMES, (False, True)):
             rows = (judged.arrays["scene"] == scene) & (judged.arrays["assets"] == original)
             if rows.any():
-                print(_line(f"{scene}{', original assets' if original else ''}", camera, found[rows], truth[1][rows]))
+                on_table = judged.arrays["places"][rows] == PLACES.index("on the table")
+                name = f"{scene}{', original assets' if original else ''}"
+                print(_line(name, camera, found[rows], truth[1][rows], on_table))
 
 
 def _embedded(clip: Clip, data: Data, camera: str, rows: np.ndarray) -> np.ndarray:
@@ -456,20 +556,20 @@ def _probe(x: np.ndarray, truth: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack(found, axis=1)
 
 
-def _line(name: str, camera: str, found: np.ndarray, truth: np.ndarray) -> str:
+def _line(name: str, camera: str, found: np.ndarray, truth: np.ndarray, on_table: np.ndarray) -> str:
     values, shown = truth[:, 0], truth[:, 1]
     errors = np.linalg.norm((found - values)[:, 3:12].reshape(-1, 3, 3), axis=2)
     visible = shown[:, 3:12:3] > 0
     if camera == "gripper":
         visible &= np.linalg.norm(values[:, 3:12].reshape(-1, 3, 3), axis=2) < 0.1
-    cells = [f"{1000 * np.median(errors[visible]):.0f}"]
+    cells = [f"{1000 * np.median(errors[blocks]):.0f}" for blocks in (visible, visible & on_table)]
     if camera == "static":
         for column, middle in ((13, 0.11), (12, None), (14, 0.5), (15, 0.5)):
             middle = SLIDE_TRAVEL[name[0]] / 2 if middle is None else middle
             sure = np.abs(values[:, column] - middle) > 0.2 * middle
             right = (found[:, column] > middle) == (values[:, column] > middle)
             cells.append(f"{100 * right[sure].mean():.1f} %")
-    return f"| {name} | {camera} | " + " | ".join([*cells, *[""] * (5 - len(cells))]) + " |"
+    return f"| {name} | {camera} | " + " | ".join([*cells, *[""] * (6 - len(cells))]) + " |"
 
 
 def main() -> None:

@@ -30,6 +30,8 @@ def _open_clip() -> Any:
     """open_clip with our models added. Imported late: it is slow, and not always needed."""
     import open_clip
 
+    from . import keypoints  # noqa: F401  (timm finds lansar-desk's image encoder by its name)
+
     open_clip.add_model_config(CLIP_MODELS)
     return open_clip
 

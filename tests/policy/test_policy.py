@@ -370,7 +370,7 @@ def test_a_trained_image_encoder_begins_as_clips_and_gets_gradients_from_every_s
         found = embedded.flatten(0, 1)
         torch.testing.assert_close(found[[0, 1, 2, 4]], clip.encode_images(pictures), rtol=1e-4, atol=1e-5)
         assert not found[[3, 5]].any()
-    encoder, weight = policy.image_encoder, policy.image_encoder.visual.conv1.weight
+    encoder, weight = policy.image_encoder, policy.image_encoder.visual.trunk.convolutions[0].weight
     (whole,) = torch.autograd.grad(encoder(pictures).square().sum(), weight)
     (parts,) = torch.autograd.grad(embed_in_parts(encoder, pictures, size=3).square().sum(), weight)
     torch.testing.assert_close(parts, whole, rtol=1e-3, atol=1e-4 * whole.abs().max().item())
