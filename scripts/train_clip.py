@@ -15,7 +15,7 @@ Four losses, summed:
 
 With --text=FILE the text encoder is that file's and stays as it is, so sentences keep their embeddings, and policies
 that were trained on them can go on. `record` continues an interrupted recording; one round of all desks and assets in
-ten is held out.
+ten is held out, which is of play.
 """
 
 import itertools
@@ -31,6 +31,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import yaml
+from accelerate.utils import send_to_device
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
@@ -355,7 +356,7 @@ class Batches(Dataset):
 
     A batch is {camera: tensors}, B of them: `pictures` (B, 3, S, S) uint8, their captions' `tokens` (B, L), the
     `values` (B, 16) of their state in units and which are `shown` (B, 16), `where` the picture shows things (B, 4, 2)
-    in pixels and which are `visible` (B, 4); and {"commands": tokens (2, 34, L)}.
+    in pixels and which are `visible` (B, 4); and without --text {"commands": tokens (2, 34, L)}.
     """
 
     def __init__(self, data: Data, tokenizer: Any, options: Options) -> None:
@@ -367,8 +368,9 @@ class Batches(Dataset):
     def __getitem__(self, step: int) -> dict[str, Any]:
         rng = np.random.default_rng([self._options.seed, step])
         batch: dict[str, Any] = {camera: self._camera(camera, rng) for camera in UNITS}
-        sentences = [self._commands.draw(task, rng) for _ in range(2) for task in TASKS.values()]
-        batch["commands"] = self._tokenizer(sentences).unflatten(0, (2, -1))
+        if not self._options.text:
+            sentences = [self._commands.draw(task, rng) for _ in range(2) for task in TASKS.values()]
+            batch["commands"] = self._tokenizer(sentences).unflatten(0, (2, -1))
         return batch
 
     def _camera(self, camera: str, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -457,7 +459,7 @@ def train(options: Options) -> None:
     batches = DataLoader(Batches(data, clip.tokenizer, options), batch_size=None, num_workers=options.workers)
     with tqdm(batches, unit="update") as bar:
         for step, batch in enumerate(bar):
-            found = dict(losses(_to(batch, clip.device)))
+            found = dict(losses(send_to_device(batch, clip.device)))
             optimizer.zero_grad(set_to_none=True)
             torch.stack(list(found.values())).sum().backward()
             nn.utils.clip_grad_norm_(weights, 1.0)
@@ -474,12 +476,6 @@ def train(options: Options) -> None:
     save_file(state, partial, made)
     partial.rename(options.output)
     print(f"{options.output}: {options.output.stat().st_size / 1e6:.1f} MB; losses {means}")
-
-
-def _to(batch: Any, device: torch.device) -> Any:
-    if isinstance(batch, dict):
-        return {name: _to(part, device) for name, part in batch.items()}
-    return batch.to(device, non_blocking=True)
 
 
 CENTRES = {
