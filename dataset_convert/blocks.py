@@ -73,11 +73,6 @@ def gather_evidence(split: CalvinSplit, scene: str) -> Evidence:
     return Evidence(votes, slides)
 
 
-def block_votes(split: CalvinSplit, scene: str) -> np.ndarray:
-    """How often block column j rose in windows of a scene that lift colour i of `COLORS`, (3, 3) int64."""
-    return gather_evidence(split, scene).votes
-
-
 def contradictions(scene: str, evidence: Evidence) -> list[str]:
     """What speaks against the data being of a known scene with its known block order, in words; none for others."""
     if scene not in BLOCK_ORDER:
@@ -108,27 +103,30 @@ def _against_travel(scene: str, slides: list[float]) -> str | None:
     return f"{what}; the door of scene {scene} stops at {travel:.3f} m{of}"
 
 
-def block_order(scene: str, votes: np.ndarray, how: str = "checked") -> tuple[str, ...]:
+def block_order(scene: str, evidence: Evidence, how: str = "checked") -> tuple[str, ...]:
     """Which colour each of the three block columns of `scene_obs` holds.
 
     Args:
         scene: The scene's letter.
-        votes: See `Evidence`.
-        how: One of `BLOCK_ORDERS`: the known order, which the lifts must not contradict; the known order in any case;
-            or the order that the lifts show. Scenes without a known order always need the last.
+        evidence: What the windows show of it.
+        how: One of `BLOCK_ORDERS`: the known order, with no `contradictions`; the known order in any case; or the
+            order that the lifts show. Scenes without a known order always need the last.
 
     Returns:
         The colour of each column.
 
     Raises:
-        ValueError: The lifts contradict the known order; or they are needed, and no order explains at least 0.8 of the
-            votes better than all others.
+        ValueError: Something contradicts what is known of the scene; or lifts are needed, and no order explains at
+            least 0.8 of the votes better than all others.
     """
-    known = BLOCK_ORDER.get(scene)
+    known, votes = BLOCK_ORDER.get(scene), evidence.votes
+    against = contradictions(scene, evidence)
+    if how == "checked" and against:
+        raise ValueError(
+            f"scene {scene}: {'; '.join(against)}. {_CORRECTIONS}. --block_order=known keeps the known order all the "
+            "same, --block_order=lifts takes the one that the lifts show"
+        )
     if known is not None and how != "lifts":
-        against = _against_order(scene, votes) if how == "checked" else None
-        if against is not None:
-            raise ValueError(complaint(scene, [against]))
         return known
     order = known if known and _against_order(scene, votes) is None else _order_shown(votes)
     if order is None:
@@ -137,14 +135,6 @@ def block_order(scene: str, votes: np.ndarray, how: str = "checked") -> tuple[st
             f"{', '.join(known) if known else 'none'}); it needs agreeing lift_<colour>_… windows of two colours"
         )
     return order
-
-
-def complaint(scene: str, against: list[str]) -> str:
-    """The message for a user whose data contradict what is known of their scene."""
-    return (
-        f"scene {scene}: {'; '.join(against)}. {_CORRECTIONS}. --block_order=known keeps the known order all the same, "
-        "--block_order=lifts takes the one that the lifts show"
-    )
 
 
 def _score(order: tuple[str, ...], votes: np.ndarray) -> int:

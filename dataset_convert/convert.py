@@ -107,7 +107,8 @@ def _embed_and_push(config: ConvertConfig, split: CalvinSplit) -> None:
     if config.embed:
         clip = load_clip(config.clip.model, config.clip.pretrained)
         pictures = SourcePictures(split, config.target)
-        embed(config.target, pictures, clip, config.clip, num_workers=config.workers - 1)
+        readers = config.workers - 1 if config.executor == "local" else 0  # workers elsewhere are not this machine's
+        embed(config.target, pictures, clip, config.clip, num_workers=readers)
         card.write(config.target, config.repo_id)
     if config.push_to_hub:
         try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dataset_convert.calvin import CalvinSplit
-from dataset_convert.language import Window
+from dataset_convert.language import Window, scene_of
 
 MODES = ("windows", "play")
 DEDUP = ("none", "task", "frames")
@@ -82,7 +82,7 @@ def play_spans(split: CalvinSplit, excluded: Iterable[int]) -> list[Span]:
             while start < end:
                 stop = _cut(start, end, starts, ends)
                 inside = np.flatnonzero((starts >= start) & (ends <= stop) & good)
-                spans.append(Span(start, stop, _scene_of(split, start, stop), tuple(inside.tolist())))
+                spans.append(Span(start, stop, scene_of(start, stop, split.scenes), tuple(inside.tolist())))
                 start = stop
     return spans
 
@@ -97,13 +97,6 @@ def _cut(start: int, end: int, starts: np.ndarray, ends: np.ndarray) -> int:
         if not (near & (starts < stop) & (stop < ends)).any():
             return stop
     return latest
-
-
-def _scene_of(split: CalvinSplit, start: int, end: int) -> str:
-    for letter, (first, last) in split.scenes.items():
-        if first <= start and end - 1 <= last:
-            return letter
-    return ""
 
 
 def window_of_frames(span: Span, windows: list[Window]) -> np.ndarray:

@@ -121,11 +121,17 @@ def _renumber(table: pa.Table, first_episode: int, first_index: int) -> pa.Table
     """A table of meta/episodes, numbered from these on."""
     lengths = np.array(table["length"])
     ends = first_index + np.cumsum(lengths)
-    columns = {
+    columns: dict[str, Any] = {
         "episode_index": np.arange(first_episode, first_episode + len(table)),
         "dataset_from_index": ends - lengths,
         "dataset_to_index": ends,
     }
+    for key, start in (("episode_index", "episode_index"), ("index", "dataset_from_index")):
+        moved = columns[start] - np.array(table[start])
+        for name in table.column_names:
+            if name.startswith(f"stats/{key}/") and name.rsplit("/", 1)[1] not in ("std", "count"):
+                numbers = np.array(table[name].to_pylist())
+                columns[name] = (numbers + moved.reshape(-1, *[1] * (numbers.ndim - 1))).tolist()
     for name, values in columns.items():
         field = table.schema.field(name)
         table = table.set_column(table.schema.get_field_index(name), field, pa.array(values, field.type))

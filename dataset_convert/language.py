@@ -90,7 +90,7 @@ def read_windows(path: Path, scenes: dict[str, tuple[int, int]]) -> list[Window]
     if not spans:
         raise ValueError(f"{path}: holds no annotated window")
     return [
-        Window(start, end, task, sentence.strip(), _scene_of(start, end, scenes))
+        Window(start, end, task, sentence.strip(), scene_of(start, end, scenes))
         for (start, end), task, sentence in zip(spans, tasks, sentences, strict=True)
     ]
 
@@ -101,7 +101,8 @@ def _strings(stored: Iterable[Any]) -> list[str]:
     return [str(item) for item in stored]
 
 
-def _scene_of(start: int, end: int, scenes: dict[str, tuple[int, int]]) -> str:
+def scene_of(start: int, end: int, scenes: dict[str, tuple[int, int]]) -> str:
+    """The scene of frames `start` to `end`, the latter excluded; "" if they are not in one."""
     letters = (letter for letter, (first, last) in scenes.items() if first <= start and end - 1 <= last)
     return next(letters, "")
 

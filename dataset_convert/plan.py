@@ -129,12 +129,9 @@ def _block_orders(
     orders, votes, against = {}, {}, {}
     for scene in scenes:
         evidence = blocks.gather_evidence(split, scene)
-        contrary = blocks.contradictions(scene, evidence)
-        if contrary and config.block_order == "checked":
-            raise ValueError(blocks.complaint(scene, contrary))
-        orders[scene] = blocks.block_order(scene, evidence.votes, config.block_order)
+        orders[scene] = blocks.block_order(scene, evidence, config.block_order)
         votes[scene] = evidence.votes.tolist()
-        if contrary:
+        if contrary := blocks.contradictions(scene, evidence):
             against[scene] = contrary
             warn(f"warning: scene {scene}: {'; '.join(contrary)}; --block_order={config.block_order} takes no notice")
     return orders, {"block_votes": votes, "contradictions": against}

@@ -15,7 +15,9 @@ from dataset_convert.safe_pickle import load_object_array
 VALIDATION_SCENE = "D"
 """The scene of every public validation split, whatever its training split was recorded in."""
 
-_FILE = "scene_info.npy"
+SCENE_FILE = "scene_info.npy"
+"""A split's file that says which frames were recorded in which scene."""
+
 _SAMPLES = 16
 
 
@@ -46,7 +48,7 @@ def find_scenes(folder: Path, recordings: np.ndarray, chosen: str) -> Scenes:
         FileNotFoundError: Nothing says it.
         ValueError: The file is malformed, or contradicts the user.
     """
-    own, training = folder / _FILE, folder.parent / "training" / _FILE
+    own, training = folder / SCENE_FILE, folder.parent / "training" / SCENE_FILE
     is_copy = own != training and own.is_file() and training.is_file() and own.read_bytes() == training.read_bytes()
     if own.is_file() and not is_copy:
         ranges = read_scenes(own)
@@ -59,7 +61,8 @@ def find_scenes(folder: Path, recordings: np.ndarray, chosen: str) -> Scenes:
     if own != training and training.is_file():
         ranges = read_scenes(training)
         if _contain(ranges, recordings) and _numbers_agree(folder, training.parent, recordings):
-            return Scenes(_within(ranges, recordings), f"training/{_FILE}, whose ranges contain this split's frames")
+            source = f"training/{SCENE_FILE}, whose ranges contain this split's frames"
+            return Scenes(_within(ranges, recordings), source)
     if folder.name == "validation":
         return Scenes({VALIDATION_SCENE: whole}, f"validation is scene {VALIDATION_SCENE} in CALVIN's public data")
     raise FileNotFoundError(f"{own} is missing: if all of the split was recorded in one scene, name it: --scene=…")

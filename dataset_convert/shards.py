@@ -170,7 +170,7 @@ def describe(span: Span) -> dict[str, Any]:
     return {"start": span.start, "end": span.end, "scene": span.scene, "windows": list(span.windows)}
 
 
-# ---- one shard: find the bad, write the others, note
+# ---- one shard: write the good episodes, note
 
 
 def convert_shard(job: Job, shard: int) -> None:
@@ -183,8 +183,7 @@ def convert_shard(job: Job, shard: int) -> None:
     if note.exists() and _is_intact(job, note):
         return
     note.unlink(missing_ok=True)
-    bad = _find_bad(job, shard) if job.skip_bad else {}
-    written, seen = _write_others(job, shard, bad)
+    written, seen, bad = _write_good(job, shard)
     _take_note(job, shard, bad, written, seen)
 
 
@@ -208,8 +207,9 @@ def _find_bad(job: Job, shard: int) -> dict[int, str]:
     return bad
 
 
-def _write_others(job: Job, shard: int, bad: dict[int, str]) -> tuple[Written, Seen]:
-    """Writes the episodes that are not in `bad`, and adds to it those that prove defective."""
+def _write_good(job: Job, shard: int) -> tuple[Written, Seen, dict[int, str]]:
+    """Writes the episodes that are not defective; the others are returned with what is wrong with them."""
+    bad: dict[int, str] = {}
     first = job.shards[shard][0]
     position = ShardPosition(shard, first, sum(len(span) for span in job.spans[:first]))
     while True:
@@ -222,10 +222,11 @@ def _write_others(job: Job, shard: int, bad: dict[int, str]) -> tuple[Written, S
         except BadEpisode as error:
             if not job.skip_bad:
                 raise error.reason from None
-            bad[error.number] = str(error.reason)  # a part of it was written: write the others again
+            bad = bad or _find_bad(job, shard)
+            bad.setdefault(error.number, str(error.reason))  # a part of it was written: write the others again
         else:
             progress.set(sum(len(job.spans[number]) for number in job.episodes(shard)))
-            return written, seen
+            return written, seen, bad
 
 
 def _take_note(job: Job, shard: int, bad: dict[int, str], written: Written, seen: Seen) -> None:

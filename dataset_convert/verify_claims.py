@@ -71,7 +71,7 @@ class Dataset:
             evidence = blocks.gather_evidence(self.split, scene)
             if found := blocks.contradictions(scene, evidence):
                 self.contradictions[scene] = found
-            self.orders[scene] = blocks.block_order(scene, evidence.votes, request.get("block_order", "checked"))
+            self.orders[scene] = blocks.block_order(scene, evidence, request.get("block_order", "checked"))
         self.says_who_acted = records_interventions(self.split.frame_file(span.start) for span in self.spans)
         found_in = ValidationFrames(root) if request["split"] == "training" else None
         self.validation = found_in if found_in else None

@@ -203,7 +203,7 @@ def _wanted(dataset: Dataset, group: _RowGroup) -> dict[str, np.ndarray]:
 
 def _without_jumps(poses: np.ndarray) -> np.ndarray:
     """Poses whose roll, pitch and yaw lie in [0, 2 pi), [-pi, pi) and [-pi/2, 3 pi/2)."""
-    poses = poses.copy()
+    poses = poses.astype(np.float64)  # a copy; turns are added before rounding
     for column, lowest in ((3, 0.0), (4, -np.pi), (5, -np.pi / 2)):
         for _ in range(100):  # turns; CALVIN's angles need one
             poses[poses[:, column] < lowest, column] += 2 * np.pi

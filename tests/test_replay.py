@@ -91,6 +91,23 @@ def test_blocks_in_the_order_of_calvins_files_fulfil_another_task(folder):
         assert "lift_red_block_table" not in set_states(desk, recording).fulfilled
 
 
+def test_a_folder_may_lack_its_scene_and_hold_a_faulty_window(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "training/scene_info.npy").unlink()
+    file = copy / "training/lang_annotations/auto_lang_ann.npy"
+    annotations = np.load(file, allow_pickle=True).item()
+    first, _ = annotations["info"]["indx"][1]
+    annotations["info"]["indx"][1] = (first, first + 100_000)
+    np.save(file, annotations, allow_pickle=True)
+    with pytest.raises(FileNotFoundError, match="name it: --scene="):
+        FolderSource(copy, "training")
+    source = FolderSource(copy, "training", "A")
+    assert source.whole() == [0, *range(2, len(source))]
+    assert source.read(0, False).scene == "A"
+    with pytest.raises(ValueError, match="window 1 cannot be replayed"):
+        source.read(1, False)
+
+
 def test_another_scene_shows(dataset):
     tasks, _, actions = outcomes(dataset, scene="B")
     assert all(outcome.largest.max() > 10 for outcome in actions)

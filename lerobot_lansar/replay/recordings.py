@@ -10,9 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_convert.blocks import block_order, block_votes, reorder_blocks
+from dataset_convert.blocks import block_order, gather_evidence, reorder_blocks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.frames import VECTORS
+from dataset_convert.scenes import SCENE_FILE
 from lerobot_lansar.datasets import MANIFEST, find_dataset
 
 from ..calvin import ACTION_NAMES, CAMERAS, SCENE_NAMES, SCENE_OBS_NAMES, TASKS
@@ -65,6 +66,9 @@ class Source(Protocol):
     def __len__(self) -> int:
         """How many recordings it has."""
 
+    def whole(self) -> list[int]:
+        """Numbers of the recordings that can be replayed."""
+
     def read(self, number: int, pictures: bool) -> Recording:
         """Reads a recording, with or without its pictures."""
 
@@ -110,6 +114,10 @@ class DatasetSource:
 
     def __len__(self) -> int:
         return self._meta.total_episodes
+
+    def whole(self) -> list[int]:
+        """All episodes: faulty windows were left out."""
+        return list(range(len(self)))
 
     def read(self, number: int, pictures: bool) -> Recording:
         """Reads an episode.
@@ -167,6 +175,11 @@ def _as_uint8(picture: Any) -> np.ndarray:
 class FolderSource:
     """The annotated windows of one split of a CALVIN folder.
 
+    Args:
+        root: The folder.
+        split: The split's name.
+        scene: Its scene's letter if no file says it.
+
     Raises:
         FileNotFoundError: Files are missing.
         ValueError: An index file is malformed.
@@ -175,20 +188,27 @@ class FolderSource:
     unit = "window"
     control_mode = "abs"
 
-    def __init__(self, root: Path, split: str):
-        self._split = CalvinSplit(root, split)
+    def __init__(self, root: Path, split: str, scene: str = ""):
+        scene = "" if (root / split / SCENE_FILE).is_file() else scene
+        self._split = CalvinSplit(root, split, scene=scene, skip_bad=True)
         self._order = cache(self._block_order)
 
     def __len__(self) -> int:
         return len(self._split.windows)
+
+    def whole(self) -> list[int]:
+        """Windows without faults."""
+        return [number for number in range(len(self)) if number not in self._split.faults]
 
     def read(self, number: int, pictures: bool) -> Recording:
         """Reads a window; its blocks are put into red, blue, pink order as `lansar-convert` does it.
 
         Raises:
             FileNotFoundError: A frame is missing.
-            ValueError: A frame is damaged, or the blocks' order cannot be told.
+            ValueError: The window is faulty, a frame is damaged, or the blocks' order cannot be told.
         """
+        if number in self._split.faults:
+            raise ValueError(f"window {number} cannot be replayed: {self._split.faults[number]}")
         window = self._split.windows[number]
         frames = range(window.start, window.end)
         arrays = self._split.read(frames, VECTORS)
@@ -207,4 +227,4 @@ class FolderSource:
         )
 
     def _block_order(self, scene: str) -> tuple[str, ...]:
-        return block_order(scene, block_votes(self._split, scene))
+        return block_order(scene, gather_evidence(self._split, scene), "known")  # others show as failures

@@ -80,19 +80,20 @@ class ReplayConfig:
     def source(self) -> Source:
         """The recordings to choose from."""
         if self.root is not None:
-            return FolderSource(self.root, self.split)
+            return FolderSource(self.root, self.split, self.scene or "")
         assert self.repo_id is not None
         return DatasetSource(self.repo_id, self.dataset_dir)
 
     def numbers(self, source: Source) -> list[int]:
         """Which of the source's recordings to replay."""
-        if len(source) == 0:
+        if not source.whole():
             raise CommandError(
                 f"there are no {source.unit}s to replay in {self.dataset_dir or self.root or self.repo_id}"
             )
         if self.episodes is not None:
-            count = min(self.episodes, len(source))
-            return sorted(np.random.default_rng(self.seed).choice(len(source), count, replace=False).tolist())
+            whole = source.whole()
+            count = min(self.episodes, len(whole))
+            return sorted(np.random.default_rng(self.seed).choice(whole, count, replace=False).tolist())
         number = getattr(self, source.unit)
         if not 0 <= number < len(source):
             raise CommandError(f"--{source.unit}={number}: there are {source.unit}s 0 to {len(source) - 1}")

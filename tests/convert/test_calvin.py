@@ -425,7 +425,7 @@ def test_half_a_turn_may_be_stored_with_either_sign(calvin, sign):
 
 
 def order_of(calvin, scene):
-    return blocks.block_order(scene, blocks.block_votes(CalvinSplit(calvin.root, "training"), scene))
+    return blocks.block_order(scene, blocks.gather_evidence(CalvinSplit(calvin.root, "training"), scene))
 
 
 @pytest.mark.parametrize("scene", "ABCD")
@@ -435,11 +435,11 @@ def test_lifts_confirm_the_block_order_of_each_scene(tmp_path, scene):
 
 def test_lifts_overrule_a_known_block_order_only_on_request(tmp_path):
     reordered = write_calvin(tmp_path, scene="A", block_order=("red", "blue", "pink"))
-    votes = blocks.block_votes(CalvinSplit(reordered.root, "training"), "A")
+    evidence = blocks.gather_evidence(CalvinSplit(reordered.root, "training"), "A")
     with pytest.raises(ValueError, match="scene A: its lifts show the order red, blue, pink"):
-        blocks.block_order("A", votes)
-    assert blocks.block_order("A", votes, "known") == ("pink", "blue", "red")
-    assert blocks.block_order("A", votes, "lifts") == ("red", "blue", "pink")
+        blocks.block_order("A", evidence)
+    assert blocks.block_order("A", evidence, "known") == ("pink", "blue", "red")
+    assert blocks.block_order("A", evidence, "lifts") == ("red", "blue", "pink")
 
 
 def test_an_unknown_scene_needs_lifts_to_tell_its_blocks_apart(tmp_path):
@@ -455,9 +455,9 @@ def test_a_known_scene_without_lifts_keeps_its_order(tmp_path):
 
 
 def test_one_wrongly_named_lift_does_not_change_the_order():
-    votes = np.array([[9, 0, 1], [0, 8, 0], [0, 0, 9]])
-    assert blocks.block_order("D", votes) == ("red", "blue", "pink")
-    assert blocks.block_order("X", votes) == ("red", "blue", "pink")
+    evidence = blocks.Evidence(np.array([[9, 0, 1], [0, 8, 0], [0, 0, 9]]), [])
+    assert blocks.block_order("D", evidence) == ("red", "blue", "pink")
+    assert blocks.block_order("X", evidence) == ("red", "blue", "pink")
 
 
 def test_reordering_moves_whole_blocks():

@@ -191,6 +191,10 @@ def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monke
     assert column(dataset, "episode_index").tolist() == [0] * 12 + (
         [1] * 12 + [2] * 12 if mode == "windows" else [1] * 24
     )
+    for key in ("index", "episode_index"):  # statistics are of the new numbers
+        numbers, stats = column(dataset, key), dataset.meta.stats[key]
+        assert (stats["min"], stats["max"]) == (numbers.min(), numbers.max())
+        assert stats["mean"] == pytest.approx(float(np.mean(numbers)))
     for index in range(0, 36, 7):  # the videos go with it
         wanted = calvin.frames[kept[index]]["rgb_static"].transpose(2, 0, 1) / 255
         np.testing.assert_allclose(dataset[index]["observation.images.static"], wanted, atol=0.02)
@@ -221,14 +225,14 @@ def test_nothing_left_is_an_error(calvin, tmp_path, monkeypatch):
 )
 def test_contradicting_lifts_are_an_error_even_where_the_known_order_is_not_beaten(scene, votes):
     with pytest.raises(ValueError, match=f"scene {scene}: its lifts contradict each other"):
-        blocks.block_order(scene, np.array(votes))
+        blocks.block_order(scene, blocks.Evidence(np.array(votes), []))
     with pytest.raises(ValueError, match="scene X: cannot tell"):
-        blocks.block_order("X", np.array(votes))
+        blocks.block_order("X", blocks.Evidence(np.array(votes), []))
 
 
 def test_lifts_of_one_colour_or_none_leave_the_known_order():
     for votes in ([[0, 0, 0], [0, 0, 0], [0, 0, 3]], np.zeros((3, 3), int)):
-        assert blocks.block_order("D", np.array(votes)) == ("red", "blue", "pink")
+        assert blocks.block_order("D", blocks.Evidence(np.array(votes), [])) == ("red", "blue", "pink")
 
 
 def test_depth_and_touch_on_request(tmp_path):
