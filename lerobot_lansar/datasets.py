@@ -1,4 +1,4 @@
-"""What several rooms know about LeRobotDatasets: where they are, names in them, and what a policy can read of them."""
+"""What several rooms know about datasets and checkpoints: where they are, names in them, what policies read."""
 
 import os
 from pathlib import Path
@@ -18,8 +18,28 @@ NO_COMMAND = "play without a command"
 MANIFEST = "meta/calvin_source.json"
 """File in which `lansar-convert` says what a dataset was made from."""
 
+LOSSES_FILE = "losses.json"
+"""In a checkpoint's `pretrained_model`: a list of {"update": int, "training": float} and {…, "held_out": float}."""
+
 VERSION = "v3.0"
 """LeRobot's tag of the dataset format: the revision that it asks the hub for."""
+
+IGNORE_SCENE = (
+    *("mcil", "hulc", "gr1"),
+    *("eo1", "evo1", "fastwam", "groot", "lingbot_va", "molmoact2", "multi_task_dit", "pi0", "pi05", "pi0_fast"),
+    *("smolvla", "vla_jepa", "vqbet", "wall_x", "xvla"),
+)
+"""Types of policies that never read it, although LeRobot lists it among the inputs of a policy whose dataset has it."""
+
+
+def reads_scene(policy_type: str | None, use_spatial_context: bool = True) -> bool:
+    """Whether a policy reads `environment_state` if it is there; those that are not known count as reading it.
+
+    Args:
+        policy_type: `--policy.type`.
+        use_spatial_context: LanSAR's option; policies without it have none.
+    """
+    return use_spatial_context and policy_type not in IGNORE_SCENE
 
 
 def feature_problems(features: dict[str, Any], sizes: dict[str, int]) -> list[str]:

@@ -1,20 +1,22 @@
 """Mistakes that show only in the options of the running LeRobot command, of which LeRobot tells an environment nothing.
 
 The options are read with LeRobot's own functions, from the command line. Those in a file of `--config_path` are not
-seen, except the policy's path.
+seen, except the policy's path and what decides whether a new policy reads the scene's state.
 """
 
 import json
 from pathlib import Path
 from typing import Any
 
+import yaml
 from huggingface_hub import hf_hub_download
 from lerobot.configs import DEFAULT_DEPTH_UNIT, PreTrainedConfig, parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME
-from lerobot.utils.constants import HF_LEROBOT_HOME, OBS_ENV_STATE, OBS_IMAGES
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
 from ..calvin import CAMERAS
 from ..command import CommandError
+from ..datasets import find_dataset, reads_scene
 from .pictures import Pictures
 from .spaces import EnvironmentState
 
@@ -133,7 +135,7 @@ def _training_of(policy: str) -> dict[str, Any]:
 def shapes_read(policy: PreTrainedConfig) -> dict[str, tuple[int, ...]]:
     """The shapes of what a policy reads, by key."""
     found = {key: tuple(feature.shape) for key, feature in (policy.input_features or {}).items()}
-    if not getattr(policy, "use_spatial_context", True):  # a LanSAR may have it among its inputs all the same
+    if not reads_scene(policy.type, getattr(policy, "use_spatial_context", True)):
         found.pop(OBS_ENV_STATE, None)
     return found
 
@@ -149,6 +151,20 @@ def _trained_shapes() -> dict[str, tuple[int, ...]]:
         return shapes_read(PreTrainedConfig.from_pretrained(policy))
     if dataset is None:
         return {}
-    file = Path(parser.parse_arg("dataset.root") or HF_LEROBOT_HOME / dataset, "meta", "info.json")
-    features = json.loads(file.read_text())["features"] if file.is_file() else {}
-    return {key: tuple(feature["shape"]) for key, feature in features.items()}
+    root = parser.parse_arg("dataset.root")
+    try:
+        file = find_dataset(dataset, None if root is None else Path(root)) / "meta/info.json"
+        features = json.loads(file.read_text())["features"]
+    except FileNotFoundError:
+        return {}
+    spatial = str(_policy_option("use_spatial_context")).lower() != "false"
+    ignored = () if reads_scene(_policy_option("type"), spatial) else (OBS_ENV_STATE,)
+    return {key: tuple(feature["shape"]) for key, feature in features.items() if key not in ignored}
+
+
+def _policy_option(name: str) -> Any:
+    """The value of a new policy's option, from the command line or else from the file of `--config_path`; or None."""
+    value, file = parser.parse_arg(f"policy.{name}"), parser.parse_arg("config_path")
+    if value is not None or file is None or not Path(file).is_file():
+        return value
+    return (yaml.safe_load(Path(file).read_text()).get("policy") or {}).get(name)

@@ -14,7 +14,9 @@ from ..benchmark import LH_MTLC
 from ..calvin import CAMERAS, CONTROL_HZ, ROBOT_OBS_NAMES, STEPS_PER_COMMAND
 from ..command import CommandError
 from ..desk import Desk
+from ..desk.assets import find_assets
 from ..desk.render import OURS
+from ..desk.scenes import get_scene
 from ..pictures import check_size
 from .calvin import LARGEST_RENDER, CalvinEnv
 from .command_line import (
@@ -173,13 +175,24 @@ class CalvinEnvConfig(EnvConfig):
         """Processors that change nothing. LeRobot asks for them before the first step, in training too.
 
         Raises:
-            CommandError: The command's policy was trained with another `environment_state`
+            CommandError: An option cannot be used. The command's policy was trained with another `environment_state`
                 (`--env.scene_state`, `--env.task_in_state`), or on pictures of another size, or on depth. Or the
                 command records what LeRobot would mix up or cannot store.
         """
         refuse_recording(mixed=self.sentence == "random" or LH_MTLC in self.suites(), depth=self.depth)
         check_policy(self._environment_state(), self._pictures())
+        self._try()
         return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(steps=[])
+
+    def _try(self) -> None:
+        """Refuses what the environments would refuse, of which a training has none before its first evaluation."""
+        try:
+            for tasks in self.suites().values():
+                for task in tasks:
+                    CalvinEnv(task=task, **self.gym_kwargs)  # opens no desk
+            find_assets(get_scene(self.scene), self.assets)
+        except (OSError, ValueError) as error:
+            raise CommandError(f"--env: {error}") from error
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task: `{suite: {number of the task in it: environment}}`.

@@ -30,7 +30,7 @@ class Pictures:
     """Which pictures an observation holds, and in which form. `CalvinEnv` explains the fields.
 
     Raises:
-        DeskError: A camera or a unit is unknown.
+        DeskError: A camera or a unit is unknown, or depth or poses are wanted of no camera.
         ValueError: The size is out of range.
     """
 
@@ -44,6 +44,9 @@ class Pictures:
         for camera in self.cameras:
             if camera not in CAMERAS:
                 raise DeskError(f"camera {camera!r} is unknown; choose among {', '.join(CAMERAS)}")
+        if (self.depth or self.camera_poses) and not self.cameras:
+            wanted = "depth" if self.depth else "camera_poses"
+            raise DeskError(f"{wanted} needs cameras, of which there are none: name them, or leave {wanted} out")
         check_size("image_size", self.image_size)
         if self.depth_unit not in DEPTH_UNITS:
             raise DeskError(f"depth_unit {self.depth_unit!r} is unknown; it is 'm' or 'mm'")

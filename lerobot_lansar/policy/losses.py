@@ -6,8 +6,7 @@ LeRobot prints losses and can send them to wandb, but leaves no file of its own.
 import json
 from pathlib import Path
 
-LOSSES_FILE = "losses.json"
-"""In a checkpoint's `pretrained_model`: a list of {"update": int, "training": float} and {…, "held_out": float}."""
+from ..datasets import LOSSES_FILE
 
 EVERY = 20
 """Training batches whose losses are averaged to one entry; a checkpoint ends an entry early."""

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..command import CommandError
-
-LOSSES_FILE = "losses.json"
+from ..datasets import LOSSES_FILE
 
 Losses = tuple[dict[int, float], dict[int, float]]
 """Update to loss, of training and of held-out data."""
@@ -31,7 +30,7 @@ def read_training(path: Path, label: str | None = None) -> dict[str, Any]:
     """Reads the losses of one training.
 
     Args:
-        path: `--output_dir` of the training, or a log of it.
+        path: `--output_dir` of the training, one of its checkpoints, or a log of it.
         label: Its name; the name of the folder or file by default.
 
     Returns:
@@ -72,7 +71,8 @@ def _from_folder(folder: Path) -> tuple[str, Losses]:
     """The first source that tells anything, and what it tells."""
     checkpoints = folder / "checkpoints"
     newest = sorted(checkpoints.glob(f"[0-9]*/pretrained_model/{LOSSES_FILE}"), key=lambda p: int(p.parts[-3]))
-    for path in (checkpoints / "last" / "pretrained_model" / LOSSES_FILE, *reversed(newest)):
+    last = checkpoints / "last" / "pretrained_model" / LOSSES_FILE
+    for path in (folder / LOSSES_FILE, last, *reversed(newest)):
         if path.is_file():
             return path.relative_to(folder).as_posix(), _from_json(path)
     runs = sorted(folder.glob("wandb/*run-*/run-*.wandb"), key=lambda path: path.parent.name.removeprefix("offline-"))

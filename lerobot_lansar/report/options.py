@@ -116,5 +116,5 @@ def output_dir(config: ReportConfig) -> Path:
         return config.output_dir
     folders = as_list(config.eval_dir) or as_list(config.train_dir)
     if len(folders) != 1 or Path(folders[0]).is_file():
-        raise CommandError("several folders or a log are reported: give the report its own folder, --output_dir")
+        raise CommandError("give the report its own folder, --output_dir: what it reports is not one folder")
     return Path(folders[0])

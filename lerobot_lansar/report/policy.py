@@ -6,7 +6,7 @@ from typing import Any
 
 from ..calvin import SCENE_OBS_NAMES, TASKS
 from ..command import CommandError
-from ..datasets import MANIFEST, dataset_folder
+from ..datasets import MANIFEST, find_dataset, reads_scene
 from .published import GRIPPER, ROBOT, SCENE, STATIC, TASK
 
 LOOK = ("renderer", "assets", "image_size")
@@ -43,9 +43,8 @@ class Policy:
     @property
     def reads_scene_state(self) -> bool:
         """Whether it reads the simulator's own state."""
-        # LanSAR may ignore the scene state although its inputs include it.
-        reads = self._config.get("use_spatial_context", True) and "observation.environment_state" in self._inputs
-        return reads and self._environment_state_size != len(TASKS)
+        reads = reads_scene(self._config.get("type"), self._config.get("use_spatial_context", True))
+        return reads and self._environment_state_size not in (None, len(TASKS))
 
     @property
     def _environment_state_size(self) -> int | None:
@@ -76,7 +75,7 @@ class Policy:
 
         Its training's options, beside it, name the dataset, whose manifest names the look.
         """
-        if not any(key.startswith("observation.image") for key in self._inputs):
+        if not self._config.get("use_images") and not any(key.startswith("observation.image") for key in self._inputs):
             return None
         try:
             dataset = json.loads(self._file(self._path, "train_config.json").read_text())["dataset"]
@@ -89,7 +88,10 @@ class Policy:
     def _manifest(self, dataset: dict[str, Any]) -> Path:
         """The manifest of the dataset that a training's options name: on this machine, or else from the hub."""
         root = dataset.get("root")
-        file = dataset_folder(dataset["repo_id"], None if root is None else Path(root)) / MANIFEST
+        try:
+            file = find_dataset(dataset["repo_id"], None if root is None else Path(root)) / MANIFEST
+        except FileNotFoundError:
+            file = Path()
         return file if file.is_file() else self._fetch(dataset["repo_id"], MANIFEST, "dataset", dataset.get("revision"))
 
     def _file(self, path: str, name: str) -> Path:

@@ -5,11 +5,14 @@ import io
 import json
 import sys
 from contextlib import nullcontext, redirect_stdout
+from pathlib import Path
 
 import draccus
+import lerobot.policies
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
@@ -20,6 +23,7 @@ from lerobot.processor import RelativeActionsProcessorStep
 import lerobot_policy_lansar  # noqa: F401  (registers the environment)
 from lerobot_lansar.calvin import ACTION_NAMES, TASK_GROUPS, TASKS, continuous_euler
 from lerobot_lansar.command import CommandError
+from lerobot_lansar.datasets import reads_scene
 from lerobot_lansar.desk import Desk
 from lerobot_lansar.desk.sentences import COMMANDS
 from lerobot_lansar.envs import CalvinEnv
@@ -93,6 +97,41 @@ def test_another_frame_rate_is_refused_with_the_reason():
         draccus.parse(CalvinEnvConfig, args=["--fps=10"])
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"renderer": "opengl"}, "renderer 'opengl' is unknown"),
+        ({"control_mode": "absolute"}, "it is 'rel' or 'abs'"),
+        ({"scene": "E"}, "start in scene D, not 'E'"),
+        ({"annotations": "none.yaml"}, "none.yaml does not exist"),
+        ({"steps_per_command": 0}, "steps_per_command"),
+        ({"assets": "nowhere"}, "asset file nowhere.* is missing"),
+    ],
+)
+def test_options_that_cannot_work_are_refused_before_a_training_begins(monkeypatch, options, message):
+    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
+    with pytest.raises(CommandError, match=rf"--env: .*{message}"):
+        CalvinEnvConfig(task="lh_mtlc,open_drawer", **options).get_env_processors()
+
+
+def test_depth_of_no_camera_is_refused():
+    for name in ("depth", "camera_poses"):
+        with pytest.raises(CommandError, match=f"{name} needs cameras"):
+            CalvinEnvConfig(cameras=[], **{name: True})
+
+
+def test_it_is_known_which_of_lerobots_policies_read_the_scenes_state():
+    folder = Path(lerobot.policies.__file__).parent
+    reading = {}
+    for file in folder.glob("*/configuration_*.py"):
+        kind = file.parent.name
+        if kind in PreTrainedConfig.get_known_choices():
+            sources = "".join(path.read_text() for path in file.parent.glob("*.py"))
+            reading[kind] = "env_state" in sources or "OBS_ENV_STATE" in sources
+    assert {kind for kind, reads in reading.items() if reads} >= {"act", "diffusion", "tdmpc"}
+    assert {kind: reads_scene(kind) for kind in reading} == reading
+
+
 def act(folder, size):
     """A checkpoint's configuration, of an ACT that was trained on so many numbers of environment state."""
     features = {"observation.environment_state": {"type": "ENV", "shape": [size]}} if size else {}
@@ -117,12 +156,17 @@ def test_a_forgotten_part_of_the_environment_state_is_named_before_the_first_ste
     dataset = tmp_path / "dataset" / "meta" / "info.json"
     dataset.parent.mkdir(parents=True)
     dataset.write_text(json.dumps({"features": {"observation.environment_state": {"shape": [trained]}}}))
-    trains = ["--policy.type=act", "--dataset.repo_id=you/desk", f"--dataset.root={tmp_path / 'dataset'}"]
-    for arguments in ([act(tmp_path, trained)], trains):
+    data = ["--dataset.repo_id=you/desk", f"--dataset.root={tmp_path / 'dataset'}"]
+    for arguments in ([act(tmp_path, trained)], ["--policy.type=act", *data]):
         monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments])
         CalvinEnvConfig(**right).get_env_processors()
         with pytest.raises(CommandError, match=f"trained on {trained} numbers .*set {option}$"):
             CalvinEnvConfig(**wrong).get_env_processors()
+    file = tmp_path / "train.yaml"
+    file.write_text("policy: {type: lansar, use_spatial_context: false}")
+    for ignoring in (["--policy.type=hulc"], [f"--config_path={file}"]):
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", *ignoring, *data])
+        CalvinEnvConfig(**wrong).get_env_processors()
 
 
 def test_a_policy_that_reads_no_environment_state_may_have_any(tmp_path, monkeypatch):

@@ -54,6 +54,8 @@ def test_losses_that_lansar_wrote_come_first(tmp_path):
     assert found["held_out"] == [[20, 0.7], [30, 0.6]]
     checkpoint(tmp_path, "last", losses__json=kept((1, 2, 3)))
     assert read_training(tmp_path)["training"] == [[1, 2.0]], "last is the newest, whatever its number"
+    one = tmp_path / "checkpoints/000100/pretrained_model"
+    assert read_training(one)["training"] == [[10, 0.9]], "one checkpoint may be named"
 
 
 def test_losses_that_are_not_finite_are_kept_as_unknown(tmp_path):

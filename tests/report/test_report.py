@@ -172,6 +172,7 @@ def test_another_protocol_than_calvins_is_stated(tmp_path, settings, note):
         (["state", "images.static"], {}, ["static picture", "robot state"]),
         (["images.static", "images.gripper"], {}, ["static picture", "gripper picture"]),
         (["environment_state"], {"use_spatial_context": False}, []),
+        (["state", "environment_state"], {"type": "smolvla"}, ["robot state"]),
         (["environment_state 58"], {}, ["scene state (privileged)", "commanded task (34 numbers)"]),
         (["state", "environment_state 34"], {}, ["robot state", "commanded task (34 numbers)"]),
         (
@@ -228,14 +229,14 @@ def test_a_policy_that_has_moved_is_unknown_until_its_new_place_is_given(tmp_pat
     assert row_of(tmp_path / "eval", policy_path=moved)["policy_reads_scene_state"] is False
 
 
-def trained_on(folder, look, *features):
+def trained_on(folder, look, *features, **options):
     """A policy that reads these features, and its dataset with this look in its manifest."""
     manifest = folder / "data" / "meta" / "calvin_source.json"
     manifest.parent.mkdir(parents=True)
     manifest.write_text(json.dumps({"request": {}, **({} if look is None else {"look": look})}))
-    options = {"dataset": {"repo_id": "you/desk", "root": str(manifest.parents[1]), "revision": None}}
-    (folder / "train_config.json").write_text(json.dumps(options))
-    return write_policy(folder, *features)
+    training = {"dataset": {"repo_id": "you/desk", "root": str(manifest.parents[1]), "revision": None}}
+    (folder / "train_config.json").write_text(json.dumps(training))
+    return write_policy(folder, *features, **options)
 
 
 PUBLIC = {"renderer": "gl", "assets": "original", "image_size": None}
@@ -253,11 +254,14 @@ PUBLIC = {"renderer": "gl", "assets": "original", "image_size": None}
         (PUBLIC, ["static"], {"assets": "original", "image_size": 128}, "image_size 0 (evaluated: 128)"),
         ({"assets": "original"}, ["static"], {"renderer": "tiny", "assets": "original", "image_size": 64}, None),
         (PUBLIC, [], {"renderer": "tiny"}, None),
+        (PUBLIC, ["embeddings"], {"renderer": "tiny", "assets": "original"}, "renderer gl (evaluated: tiny)"),
         (None, ["static"], {"renderer": "tiny"}, None),
     ],
 )
 def test_another_look_than_the_datasets_is_noticed(tmp_path, look, features, settings, note):
-    policy = trained_on(tmp_path / "policy", look, *(f"images.{name}" for name in features))
+    embedded = features == ["embeddings"]  # LanSAR's pictures are not among its inputs
+    inputs = () if embedded else (f"images.{name}" for name in features)
+    policy = trained_on(tmp_path / "policy", look, *inputs, use_images=embedded)
     folder = write_lines(tmp_path / "eval", [(1000, 0, [("open_drawer", False)])], **settings)
     notes = [note for note in row_of(folder, policy_path=policy)["notes"] if "another look" in note]
     assert len(notes) == (note is not None)
