@@ -3,7 +3,6 @@
 Each finished episode has a line in OUTPUT_DIR/episodes.jsonl. Episodes that have one are not played again.
 """
 
-import hashlib
 import json
 import os
 import shlex
@@ -21,6 +20,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from ..benchmark import EPISODES_FILE, LH_MTLC
 from ..calvin import CHAIN_LENGTH
+from ..clip.store import sha256
 from ..command import CommandError, run_command
 from ..envs.command_line import evaluated_policy
 from ..jobs.executors import run_shards
@@ -75,9 +75,11 @@ def _evaluate(config: EvaluateConfig) -> Path:
     episodes = planned(config)
     done = {episode.key for episode in read_lines(folder)}
     missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
-    if not missing and (folder / INFO_FILE).exists():
+    info = folder / INFO_FILE
+    told = json.loads(info.read_text())["overall"]["n_episodes"] if info.exists() else 0
+    if not missing and told == len(episodes):
         return folder
-    (folder / INFO_FILE).unlink(missing_ok=True)  # of an evaluation with fewer episodes
+    info.unlink(missing_ok=True)  # of an evaluation with fewer or more episodes
     config.workers = min(config.workers or 1, max(1, len(missing)))
     executor = config.executor if missing else "local"
     started, tally = time.time() - seconds, _Tally(config)
@@ -107,6 +109,7 @@ def _evaluate(config: EvaluateConfig) -> Path:
 
 def _make_paths_absolute(config: EvaluateConfig, env_options: dict[str, Any]) -> None:
     """For jobs, which may run in another working directory."""
+    config.output_dir = config.folder
     for name in ("assets", "annotations"):
         if env_options[name] is not None:
             env_options[name] = str(Path(env_options[name]).resolve())
@@ -154,7 +157,9 @@ def _mean(episodes: list[Played], suites: dict[str, tuple[str, ...]]) -> str:
     if not episodes:
         return ""
     mean = float(np.mean([episode.successes for episode in episodes]))
-    return f"average length {mean:.2f}" if list(suites) == [LH_MTLC] else f"success {100 * mean:.1f} %"
+    if LH_MTLC not in suites:
+        return f"success {100 * mean:.1f} %"
+    return f"average length {mean:.2f}" if len(suites) == 1 else f"{mean:.2f} commands an episode"
 
 
 def _claim(config: EvaluateConfig) -> float:
@@ -207,15 +212,10 @@ def _request(config: EvaluateConfig) -> dict[str, Any]:
     assert config.policy is not None
     options["policy"] |= {"pretrained_path": evaluated_policy()}
     files = sorted(Path(str(config.policy.pretrained_path)).glob("*.safetensors"))
-    options["weights of the policy"] = {file.name: _sha256(file) for file in files}
+    options["weights of the policy"] = {file.name: sha256(file) for file in files}
     if config.desk.annotations is not None:
-        options["env"]["annotations"] = _sha256(Path(config.desk.annotations))
+        options["env"]["annotations"] = sha256(Path(config.desk.annotations))
     return json.loads(json.dumps(options))
-
-
-def _sha256(file: Path) -> str:
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def _differences(one: Any, other: Any, name: str = "") -> list[str]:

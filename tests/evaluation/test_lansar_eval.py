@@ -133,6 +133,10 @@ def test_more_chains_are_added_to_those_that_were_played(checkpoint, undisturbed
     assert after.count(b"\n") == 10
     assert json.loads((folder / "eval_info.json").read_text())["overall"]["n_episodes"] == 10
     assert json.loads((folder / "eval_config.json").read_text())["seconds"] > seconds > 0
+    fewer = run("lansar-eval", checkpoint, folder, "--chains=8")
+    assert fewer.returncode == 0, fewer.stderr[-3000:]
+    assert json.loads((folder / "eval_info.json").read_text())["overall"]["n_episodes"] == 8, "as was asked for last"
+    assert (folder / EPISODES_FILE).read_bytes() == after
 
 
 def test_a_batch_may_be_larger_than_lerobots_default_number_of_episodes():
