@@ -33,7 +33,8 @@ class LanSARConfig(PreTrainedConfig):
 
     The defaults are the thesis' sizes (Table 4.2) with the choices that docs/RESULTS.md found better at a size that a
     CPU can train: targets from the commanded action, predictions executed without scaling, blocks also seen from the
-    hand, the command in the context, and windows that start anywhere in a demonstration, not only at its start.
+    hand, and the command in the context. Sines and cosines for angles and half of the windows from anywhere in a
+    demonstration made no difference there.
     `configs/thesis/baseline.yaml` follows the thesis to the letter.
 
     A resumed or fine-tuned run keeps the checkpoint's scaling statistics, because its weights depend on them. Options

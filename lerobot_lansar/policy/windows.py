@@ -5,7 +5,7 @@ window of at most n = `window` steps. A fixed rule says which, so that a resumed
 validation losses are comparable:
 
 * "episode": the demonstration from its start (thesis). If it is longer than n, frame j stands for the window that
-  starts at j * (L - n) / (L - 1): every start occurs equally often, and the first and last n steps are included.
+  starts at j * (L - n + 1) / L, rounded down: every start occurs equally often, give or take one frame.
 * "anywhere": at most n steps from the sampled frame, up to the demonstration's end. Step k of a demonstration is then
   in min(k + 1, n) windows, once with each history length, so the network learns to act on short histories
   everywhere: that is its situation at inference after the history was cleared.
@@ -29,6 +29,7 @@ from ..clip.model import ImageEncoder
 from ..clip.store import load_embeddings
 from .configuration_lansar import LanSARConfig
 from .frames import find_paraphrases, load_frames, load_pictures, load_sentence_tasks
+from .scaling import ENVIRONMENT_STATE_DIM
 
 
 def action_form(features: dict) -> str:
@@ -123,6 +124,12 @@ class Windows:
             "target": self.targets,
         }
         if config.use_spatial_context:
+            if "environment_state" not in self.frames:
+                raise ValueError(
+                    f"{root} lacks the scene's state, observation.environment_state with {ENVIRONMENT_STATE_DIM} "
+                    "numbers, which the policy reads: convert again without --scene_state=false and "
+                    "--task_in_state=true, or train a policy with --policy.use_spatial_context=false"
+                )
             self.arrays["environment_state"] = self.frames["environment_state"]
         self.since_command = config.since_command
         if self.counts is not None:
@@ -197,8 +204,7 @@ class Windows:
         place = row - self.frames["first"][row]
         row = first + place * (end - first) // self._lengths[row]  # the same row, unless its episode was cropped
         spare = np.maximum(end - first - self.length, 0)
-        spread = first + np.rint((row - first) * spare / np.maximum(end - first - 1, 1)).astype(np.int64)
-        spread = np.minimum(spread, first + spare)
+        spread = first + (row - first) * (spare + 1) // np.maximum(end - first, 1)
         anywhere = np.minimum(row, end - 1)
         mixed = np.where(index % 2 == 0, spread, anywhere)
         start = {"episode": spread, "anywhere": anywhere, "mixed": mixed}[self.rule]
