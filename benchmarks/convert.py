@@ -134,7 +134,8 @@ def record(episodes: int, target: Path) -> None:
         "lerobot_lansar.demos.record",
         f"--output_dir={target}",
         f"--episodes={episodes}",
-        "--validation_episodes=2",
+        "--scene=[A,B,C,D]",
+        "--validation_episodes=4",
         "--workers=2",
         "--cameras=[static,gripper]",
     ]

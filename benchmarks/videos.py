@@ -67,7 +67,7 @@ class Row:
 
 def record(target: Path, assets: str | None) -> Path:
     """Records demonstrations of all tasks on all desks; returns the folder of the frames."""
-    words = ["--scene=[A,B,C,D]", "--episodes=34", "--validation_episodes=4", "--workers=2", f"--output_dir={target}"]
+    words = ["--scene=[A,B,C,D]", "--episodes=136", "--validation_episodes=4", "--workers=2", f"--output_dir={target}"]
     words += [f"--assets={assets}"] if assets else []
     command = [sys.executable, "-m", "lerobot_lansar.demos.record", *words]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

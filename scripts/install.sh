@@ -6,7 +6,11 @@ command -v c++ >/dev/null 2>&1 || command -v g++ >/dev/null 2>&1 || {
     echo "A C++ compiler is needed to build pybullet, for example: apt install g++. Without one: docs/installation.md" >&2
     exit 1
 }
-if ! .venv/bin/python -c 'import sys; sys.exit(sys.version_info < (3, 12))' >/dev/null 2>&1; then
+right='(3, 12) <= sys.version_info < (3, 14)'
+if [ -n "${PYTHON:-}" ]; then # named: the one that is there must be of the same version
+    right="sys.version_info[:2] == $("$python" -c 'import sys; print(tuple(sys.version_info[:2]))')"
+fi
+if ! .venv/bin/python -c "import sys; sys.exit(not $right)" >/dev/null 2>&1; then
     rm -rf .venv
     "$python" -m venv .venv
 fi

@@ -108,8 +108,8 @@ class Thesis:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
-        self.out = Path(options.output_dir).resolve()
-        self.dataset = Path(options.dataset or self.out / "data/lerobot").resolve()
+        self.out = options.output_dir
+        self.dataset = options.dataset or self.out / "data/lerobot"
         self.started = time.time()
         self.seconds = 60.0 * options.minutes
         self.problems: list[str] = []
@@ -320,6 +320,8 @@ def main() -> int:
         options.device = "cpu"
         options.eval_device = "cpu"
     options.eval_device = options.eval_device or options.device
+    options.output_dir = Path(options.output_dir).resolve()
+    options.dataset = options.dataset and Path(options.dataset).resolve()
     os.chdir(ROOT)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that `run` ends its command, too
     return Thesis(options).main()

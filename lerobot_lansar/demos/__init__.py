@@ -5,6 +5,8 @@ moves            what skills are built from: waypoints, the view of the desk, tr
 motion           waypoints to actions: smooth, with noise
 demonstrator     one task, from a random start or from where the desk is
 interrupted      takeovers in the middle of a task, to measure the demonstrator by
+takeovers        chains in which a policy acts and the demonstrator takes over
+stuck            when a policy is stuck
 play             tasks one after the other without a reset, and the language windows cut from that
 calvin_folder    frames, windows and sentences on disk
 record_config    the options of lansar-record

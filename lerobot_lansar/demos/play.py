@@ -168,7 +168,7 @@ def feasible_tasks(scene: Scene, snapshot: Snapshot, obs: Observation, before: s
         before: The task that has just been fulfilled, if any.
     """
     view = View(scene, obs["robot_obs"], obs["scene_obs"], np.random.default_rng(0), Style())
-    held = next((color for color, block in snapshot.blocks.items() if block.bodies == {"robot"}), None)
+    held = snapshot.held
     if held is not None and not view.holds(held):
         return []  # the block hangs on the hand, but not between the fingers
     tasks = []

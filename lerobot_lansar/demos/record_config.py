@@ -13,6 +13,9 @@ from ..pictures import check_size
 from .play import GROUPS
 from .skills import SKILLS
 
+_SHORTEST = 0.1 / 60
+"""Hours of the shortest recording."""
+
 SPLITS = ("training", "validation")
 MODES = ("windows", "play", "chains", "takeovers")
 
@@ -100,7 +103,7 @@ class RecordConfig:
     weights: dict[str, float] = field(default_factory=dict)
     # Decides all random choices: the same seed gives the same data for any number of workers.
     seed: int = 0
-    # Pictures to record: static, gripper; '[]' records states only, about twice as fast.
+    # Pictures to record: static, gripper; '[]' records states only, at least twice as fast.
     cameras: list[str] = field(default_factory=lambda: ["static", "gripper"])
     # Record the cameras' depth too (m), as in CALVIN's public data.
     depth: bool = False
@@ -137,10 +140,10 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         if self.validation_episodes is None:
-            one_of_each = len(set(self.tasks)) * len(self.scenes)
+            one_of_each = len(self.tasks) * len(self.scenes)
             self.validation_episodes = max(one_of_each, round(self.episodes / 10))
         if self.validation_hours is None:
-            self.validation_hours = self.hours / 10
+            self.validation_hours = max(self.hours / 10, _SHORTEST)
 
     def check(self) -> None:
         """Raises ValueError for options that cannot be carried out."""
@@ -170,9 +173,12 @@ class RecordConfig:
             if getattr(self, name) < 1:
                 raise DeskError(f"--{name} must be at least 1, got {getattr(self, name)}")
         for name, minutes in (("hours", 60), ("validation_hours", 60), ("session_minutes", 1)):
-            if not 0.1 <= getattr(self, name) * minutes <= 1e6:
+            if not _SHORTEST * 60 <= getattr(self, name) * minutes <= 1e6:
                 raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
         self._check_takeovers()
+        for name in ("hours", "session_minutes") if self.mode == "windows" else ("episodes",):
+            if getattr(self, name) != self.__dataclass_fields__[name].default:
+                raise DeskError(f"--{name} has no effect with --mode={self.mode}: leave it out, or choose another mode")
         for group, weight in self.weights.items():
             if group not in GROUPS:
                 raise DeskError(f"--weights: there is no group {group!r} of tasks; choose among: {', '.join(GROUPS)}")

@@ -88,7 +88,7 @@ class Watch:
             self._still += 1
 
     def _see_carried(self, now: Snapshot) -> None:
-        held = next((color for color, block in now.blocks.items() if block.bodies == {"robot"}), None)
+        held = now.held
         if held is not None:
             self._carried, self._loose = held, 0
         elif self._carried is not None and "robot" not in now.blocks[self._carried].bodies:

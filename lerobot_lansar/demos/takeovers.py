@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from gymnasium.vector.utils import concatenate, create_empty_array
 from huggingface_hub import snapshot_download
+from huggingface_hub.errors import HFValidationError
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType
 from lerobot.envs.utils import preprocess_observation
@@ -56,7 +57,10 @@ def prepare(config: RecordConfig) -> RecordConfig:
     """
     path = str(config.policy.path)
     if not Path(path).is_dir():
-        path = snapshot_download(path)
+        try:
+            path = snapshot_download(path)
+        except HFValidationError:
+            raise CommandError(f"--policy.path={path} is neither a folder nor a name on the hub") from None
     policy = replace(config.policy, path=str(Path(path).resolve()), sha256=checkpoint_sha256(Path(path)))
     unit = config.env.depth_unit or (trained_depth_unit() if config.depth else None)
     config = replace(config, policy=policy, env=replace(config.env, depth_unit=unit))

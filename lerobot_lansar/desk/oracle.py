@@ -65,6 +65,11 @@ class Snapshot:
     blocks: dict[str, BlockState]
     touched_by_robot: frozenset[str]
 
+    @property
+    def held(self) -> str | None:
+        """Colour of the block that nothing but the robot touches; None if there is none."""
+        return next((color for color, block in self.blocks.items() if block.bodies == {"robot"}), None)
+
 
 Condition = Callable[[Snapshot, Snapshot], bool]
 """Whether a task is fulfilled, given the snapshots at its start and now."""

@@ -401,6 +401,8 @@ CHAINS = {"mode": "chains", "tasks": list(SKILLS)}
         ({"seed": -1}, "--seed must be 0 or more"),
         ({"scene": "D_eval"}, "--scene: 'D_eval' is none of A, B, C, D"),
         ({"mode": "play"}, "--tasks goes with --mode=windows"),
+        ({"hours": 5.0}, "--hours has no effect with --mode=windows"),
+        ({"episodes": 3, **CHAINS}, "--episodes has no effect with --mode=chains"),
         (
             {"weights": {"lift": 2.0}, **CHAINS},
             "--weights: there is no group 'lift' of tasks; choose among",

@@ -71,7 +71,10 @@ def _egl_works(plugin: str) -> bool:
     """Whether the plugin can be loaded; tried in another process, because without a driver it ends the process."""
     code = "import pybullet as p, sys; p.connect(p.DIRECT); sys.exit(p.loadPlugin(sys.argv[1], sys.argv[2]) < 0)"
     command = [sys.executable, "-c", code, plugin, _PLUGIN]
-    return subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+    try:
+        return subprocess.run(command, capture_output=True, timeout=60).returncode == 0
+    except subprocess.TimeoutExpired:  # a driver that hangs
+        return False
 
 
 def load_egl(client: int) -> int:
