@@ -180,10 +180,11 @@ def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monke
     calvin = write_calvin(tmp_path / "calvin", rgb=True, length=12)
     record_as(calvin, (100, 111), (112, 123), (124, 147))
     DEFECTS[defect](calvin, frame)
+    images = "video" if "picture" in defect or frame == 113 else "none"  # encoding takes most of the time
     start, end = (100, 112) if frame == 100 else (112, 124)
     with pytest.raises((ValueError, FileNotFoundError), match=f"episode_0000{frame}"):
-        convert.convert(options(calvin, tmp_path / "strict", images="video", mode=mode))
-    out = convert.convert(options(calvin, tmp_path / "out", images="video", mode=mode, skip_bad=True))
+        convert.convert(options(calvin, tmp_path / "strict", images=images, mode=mode))
+    out = convert.convert(options(calvin, tmp_path / "out", images=images, mode=mode, skip_bad=True))
     dataset = load(out)
     kept = [number for number in range(100, 148) if not start <= number < end]
     assert column(dataset, "calvin.frame").tolist() == kept
@@ -195,7 +196,7 @@ def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monke
         numbers, stats = column(dataset, key), dataset.meta.stats[key]
         assert (stats["min"], stats["max"]) == (numbers.min(), numbers.max())
         assert stats["mean"] == pytest.approx(float(np.mean(numbers)))
-    for index in range(0, 36, 7):  # the videos go with it
+    for index in range(0, 36, 7) if images == "video" else ():  # the videos go with it
         wanted = calvin.frames[kept[index]]["rgb_static"].transpose(2, 0, 1) / 255
         np.testing.assert_allclose(dataset[index]["observation.images.static"], wanted, atol=0.02)
     (bad,) = manifest_of(out)["left_out"]
