@@ -26,11 +26,11 @@ def options(output_dir, **changes):
     defaults = {
         "output_dir": output_dir,
         "tasks": ["turn_on_led", "lift_red_block_table"],
-        "episodes": 4,
-        "validation_episodes": 2,
         "cameras": [],
         "seed": 3,
     }
+    if changes.get("mode", "windows") == "windows":
+        defaults |= {"episodes": 4, "validation_episodes": 2}
     return RecordConfig(**(defaults | changes))
 
 
