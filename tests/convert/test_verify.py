@@ -48,6 +48,16 @@ def test_a_fresh_dataset_equals_its_source(tmp_path, options, episodes, frames, 
     assert told.count("pixel by pixel") == exact
 
 
+def test_a_source_in_single_precision_is_equal_too(calvin, tmp_path):
+    angles = np.random.default_rng(0).uniform(-3, 3, (len(calvin.frames), 3))
+    for turned, (frame, content) in zip(angles, calvin.frames.items(), strict=True):
+        pose = np.r_[content["robot_obs"][:3], turned, content["robot_obs"][6:]].astype(np.float32)
+        action = np.r_[content["actions"][:3], pose[3:6] + content["rel_actions"][3:6] * 0.05, content["actions"][6]]
+        calvin.rewrite(frame, robot_obs=pose, actions=action)
+    out = convert(ConvertConfig(calvin.root, "me/desk", tmp_path / "out", images="none"))
+    assert "48 frames equal" in verify.verify(VerifyConfig("me/desk", calvin.root, out))
+
+
 def shade(source):
     """Makes every picture another one when it is flipped, transposed, of other colours or of the next frame."""
     for frame, content in source.frames.items():
