@@ -31,15 +31,6 @@ def make_windows(root, **options):
     return Windows(meta.root, meta.features, meta.total_frames, small_config(**options))
 
 
-def test_a_dataset_without_the_scenes_state_is_named(tmp_path):
-    make_dataset(tmp_path, lengths=(5, 7))
-    for file in (tmp_path / "data").rglob("*.parquet"):
-        pq.write_table(pq.read_table(file).drop(["observation.environment_state"]), file)
-    with pytest.raises(ValueError, match=r"lacks the scene's state.* 24 numbers.*--policy\.use_spatial_context=false"):
-        make_windows(tmp_path)
-    make_windows(tmp_path, use_spatial_context=False)
-
-
 def episode_of(index):
     """(episode, frame within it) of an absolute frame number."""
     episode = int(np.searchsorted(STARTS, index, side="right") - 1)
@@ -193,6 +184,8 @@ def test_without_the_scenes_state_windows_have_none(tmp_path, width):
     info.write_text(json.dumps(told))
     for _ in range(2):  # from the files, from the cache
         assert "environment_state" not in load_frames(tmp_path / "data")
+    with pytest.raises(ValueError, match=r"lacks the scene's state.* 24 numbers.*--policy\.use_spatial_context=false"):
+        make_windows(tmp_path / "data")
     config = small_config(use_images=True, use_spatial_context=False)
     add_embeddings(tmp_path / "data", Clip(config.clip))
     policy = LanSARPolicy(config, dataset_meta=dataset_meta(tmp_path / "data"))
