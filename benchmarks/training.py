@@ -9,13 +9,15 @@ Reading: milliseconds of CPU per sample, a window of the preset's length (with p
 LanSAR reads it, with LeRobot's own delta timestamps, and as a bare lookup in memory-mapped arrays, the floor.
 
 Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, AdamW). PyTorch
-counts the FLOP; the ceiling is its product of 2048 x 2048 matrices on the same device and dtype. Without --root the
-data are random demonstrations of 64 steps in a temporary folder.
+counts the FLOP; the ceiling is its product of 2048 x 2048 matrices (8192 x 8192 on a GPU) on the same device and dtype.
+On a GPU, one more update counts where the CPU waits for it (torch.cuda.set_sync_debug_mode). Without --root the data
+are random demonstrations of 64 steps in a temporary folder.
 """
 
 import json
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -141,6 +143,18 @@ def finished(device: str) -> None:
         torch.cuda.synchronize()
 
 
+def waits(update: Callable[[], None]) -> list[str]:
+    """Places in the code where one update makes the CPU wait for the GPU; there should be none."""
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            update()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    return [f"{w.filename}:{w.lineno}" for w in found if "synchroniz" in str(w.message)]
+
+
 def updates(options: Options, variant: str, config: LanSARConfig, root: Path) -> dict[str, Any]:
     """Times and arithmetic of whole updates."""
     precision, _, compiled = variant.partition("+")
@@ -202,6 +216,10 @@ def updates(options: Options, variant: str, config: LanSARConfig, root: Path) ->
         waiting.append(ready - start)
         computing.append(time.perf_counter() - ready)
         steps.append(len(batch["valid_steps"]))
+    waiting_for_gpu = None
+    if device_type == "cuda":
+        batch = preprocess(next(source))
+        waiting_for_gpu = waits(lambda: update(batch))
     data, compute = (sum(values[WARM_UP:]) / options.updates for values in (waiting, computing))
     rate = operations * sum(steps[WARM_UP:]) / sum(computing[WARM_UP:]) / 1e12
     largest = ceiling(options.device, dtype)
@@ -219,6 +237,7 @@ def updates(options: Options, variant: str, config: LanSARConfig, root: Path) ->
         "ceiling_tflop_per_s": largest,
         "share_of_ceiling": rate / largest,
         "warm_up_s": sum(waiting[:WARM_UP]) + sum(computing[:WARM_UP]),
+        "waits_for_gpu": waiting_for_gpu,
         "hours_for_30000_updates": 30_000 * (data + compute) / 3600,
     }
 
@@ -242,7 +261,7 @@ def main(options: Options) -> None:
         for variant in options.variants:
             config = load_preset(options.preset, options.device)
             rows.append(updates(options, variant, config, options.root or Path(scratch) / "own"))
-            print({name: value if isinstance(value, str) else round(value, 4) for name, value in rows[-1].items()})
+            print({name: round(value, 4) if isinstance(value, float) else value for name, value in rows[-1].items()})
             if options.output:  # whatever becomes of the next variant
                 write(options, read, rows)
     floor = read["bare lookup"]

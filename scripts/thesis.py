@@ -1,13 +1,14 @@
 """The thesis' size, trained and evaluated with and without the recommended choices, on one GPU. Run by `make thesis`.
 
-    python scripts/thesis.py [--minutes=60] [--chains=300] [--device=cuda] [--workers=CORES] [--dataset=FOLDER]
+    python scripts/thesis.py [--minutes=60] [--pictures] [--chains=300] [--device=cuda] [--workers=CORES]
+        [--dataset=FOLDER]
     python scripts/thesis.py --dry_run      # everything with tiny sizes, on a CPU
 
 Record chains on the built-in desk, convert, train both, evaluate both with lansar-eval, compare with lansar-report.
-State and language only: the thesis' row is its "No Image". While the cores record, the GPU measures how fast it trains;
-the number of updates follows from that and from --minutes, and result.json says it. With --dataset, nothing is
-recorded: that LeRobotDataset is learned from. A step whose result exists is skipped. A step that fails or exceeds its
-time ends the run only if nothing can follow it. No step asks the network.
+State and language only, the thesis' "No Image"; with --pictures its Baseline, embedded by lansar-desk. While the cores
+record, the GPU measures how fast it trains; the number of updates follows from that and from --minutes, and result.json
+says it. With --dataset, nothing is recorded: that LeRobotDataset is learned from. A step whose result exists is
+skipped. A step that fails or exceeds its time ends the run only if nothing can follow it. No step asks the network.
 """
 
 import argparse
@@ -27,23 +28,16 @@ from lerobot_lansar.report.episodes import read_lines
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
-FRAMES_PER_CORE = 200
-"""Frames that one core records in a second, without pictures (docs/benchmarks.md: 224, start-up included)."""
+FRAMES_PER_CORE = {"state": 200, "pictures": 60}
+"""Frames that one core records in a second, start-up included."""
 SHARES = {"record": 0.2, "evaluate": 0.25}
 """Shares of the time for recording and for both evaluations; training takes what is left."""
 START_UP = 100
 """Seconds of a training that are no updates: imports, reading the data, compiling, the checkpoint."""
 RECORDERS = 0.75
 """Share of the cores that record; the others compile meanwhile, which takes far longer on busy ones."""
-# Pictures (the rows "Baseline" and "No Space") would need lansar-record's cameras and lansar-convert
-# --embed=true here, and configs/thesis/baseline.yaml below.
-THESIS = [
-    "--config_path=configs/thesis/no_images.yaml",
-    "--dataset.eval_split=0",
-    "--eval_steps=0",
-    "--policy.clip.model=lansar-desk",
-    "--policy.clip.pretrained=v1",
-]
+CLIP = ("clip.model=lansar-desk", "clip.pretrained=v1")
+THESIS = ["--dataset.eval_split=0", "--eval_steps=0", *(f"--policy.{option}" for option in CLIP)]
 RECOMMENDED = [
     "--policy.command_in_context=true",
     "--policy.orientation=sincos",
@@ -110,6 +104,8 @@ class Thesis:
         self.options = options
         self.out = options.output_dir
         self.dataset = options.dataset or self.out / "data/lerobot"
+        self.preset = "thesis/baseline" if options.pictures else "thesis/no_images"
+        self.cameras = () if options.pictures else ("[]",)
         self.started = time.time()
         self.seconds = 60.0 * options.minutes
         self.problems: list[str] = []
@@ -125,7 +121,8 @@ class Thesis:
         if (self.dataset / "meta/info.json").exists():
             return
         workers = max(1, int(RECORDERS * o.workers))
-        hours = SHARES["record"] * self.seconds * workers * FRAMES_PER_CORE / (30 * 3600)
+        speed = FRAMES_PER_CORE["pictures" if o.pictures else "state"]
+        hours = SHARES["record"] * self.seconds * workers * speed / (30 * 3600)
         if not (data / "chains/validation").exists():
             run(
                 "record",
@@ -135,7 +132,7 @@ class Thesis:
                 "--mode=chains",
                 f"--hours={0.02 if o.dry_run else o.hours or round(hours, 2)}",
                 "--validation_hours=0.01",
-                "--cameras=[]",
+                *(f"--cameras={none}" for none in self.cameras),
                 "--variety=0.3",
                 "--seed=0",
                 f"--workers={workers}",
@@ -152,6 +149,7 @@ class Thesis:
             "--images=none",
             f"--workers={o.workers}",
             f"--output_dir={self.dataset}",
+            *(["--embed=true", *(f"--{option}" for option in CLIP)] if o.pictures else []),
         )
 
     def measure(self) -> None:
@@ -159,7 +157,7 @@ class Thesis:
         file, o = self.out / "benchmark.json", self.options
         if file.exists():
             return
-        size = ["--preset=lansar", "--batch_size=4", "--updates=1"] if o.dry_run else ["--preset=thesis/no_images"]
+        size = ["--preset=lansar", "--batch_size=4", "--updates=1"] if o.dry_run else [f"--preset={self.preset}"]
         variants = ["float32", "bfloat16"] if o.dry_run else [*VARIANTS, "tf32", "float32"]
         try:
             run(
@@ -204,6 +202,7 @@ class Thesis:
             self.out / f"logs/train_{name}.log",
             1.5 * seconds + 60,
             "lerobot-train",
+            f"--config_path=configs/{self.preset}.yaml",
             *ROWS[name],
             "--dataset.repo_id=lansar/chains",
             f"--dataset.root={self.dataset}",
@@ -230,7 +229,7 @@ class Thesis:
             f"--policy.device={o.eval_device}",
             "--env.type=calvin",
             "--env.control_mode=abs",
-            "--env.cameras=[]",
+            *(f"--env.cameras={none}" for none in self.cameras),
             *(["--env.steps_per_command=5"] if o.dry_run else []),
             f"--chains={2 if o.dry_run else o.chains}",
             "--eval.batch_size=20",
@@ -305,6 +304,7 @@ def main() -> int:
     """Reads the options."""
     parser = argparse.ArgumentParser(description="Trains and evaluates LanSAR at the thesis' size.")
     parser.add_argument("--minutes", type=float, default=60, help="how long everything may take")
+    parser.add_argument("--pictures", action="store_true", help="learn from both cameras' pictures, too")
     parser.add_argument("--hours", type=float, help="of demonstrations; by default what a fifth of the time records")
     parser.add_argument("--dataset", help="folder of a LeRobotDataset to learn from instead of recording one")
     parser.add_argument("--chains", type=int, default=300, help="of each evaluation")

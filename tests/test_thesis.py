@@ -57,7 +57,7 @@ def test_the_whole_line_runs_without_a_network(tmp_path):
     subprocess.run([sys.executable, "-c", knock], env=environment, capture_output=True)
     assert asked.read_text() == "192.0.2.1\n", "whoever asks is written down"
     asked.unlink()
-    command = [sys.executable, SCRIPT, "--dry_run", "--workers=1", f"--output_dir={tmp_path / 'out'}"]
+    command = [sys.executable, SCRIPT, "--dry_run", "--pictures", "--workers=1", f"--output_dir={tmp_path / 'out'}"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout[-3000:]
     result = json.loads((tmp_path / "out/result.json").read_text())
@@ -70,17 +70,19 @@ def test_a_dataset_taken_along_is_learned_from_instead_of_a_recording(tmp_path, 
     thesis, commands = load(), []
     monkeypatch.setattr(thesis, "run", lambda title, log, seconds, *command: commands.append(command))
     options = argparse.Namespace(minutes=60, output_dir=tmp_path / "out", dataset=tmp_path / "taken", workers=2)
-    options.dry_run, options.hours, options.device = True, None, "cpu"
+    options.dry_run, options.hours, options.device, options.pictures = True, None, "cpu", False
     run = thesis.Thesis(options)
     run.record()
     assert [command[0] for command in commands] == ["lansar-record", "lansar-convert"], "there is none yet"
+    assert "--cameras=[]" in commands[0]
+    assert "--embed=true" not in commands[1]
     (tmp_path / "taken/meta").mkdir(parents=True)
     (tmp_path / "taken/meta/info.json").touch()
     commands.clear()
     run.record()
     assert commands == []
     run.train("thesis", 100)
-    assert f"--dataset.root={tmp_path / 'taken'}" in commands[0]
+    assert {f"--dataset.root={tmp_path / 'taken'}", "--config_path=configs/thesis/no_images.yaml"} <= {*commands[0]}
     monkeypatch.setattr(sys, "argv", ["thesis.py", f"--dataset={tmp_path / 'nowhere'}"])
     with pytest.raises(SystemExit):
         thesis.main()
