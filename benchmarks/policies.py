@@ -81,6 +81,9 @@ POLICIES = {
             "--policy.dim_feedforward=1024",
             "--policy.chunk_size=32",
             "--policy.n_action_steps=16",
+            # LeRobot's 1e-5 is for a trained backbone and a hundred thousand updates; this one begins at random.
+            "--policy.optimizer_lr=1e-4",
+            "--policy.optimizer_lr_backbone=1e-4",
             "--batch_size=8",
         ],
         TOLD,

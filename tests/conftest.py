@@ -12,10 +12,27 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # each has a core of its own
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
+LONGEST = (
+    "test_demonstrator.py",
+    "test_commands.py",
+    "test_takeovers.py",
+    "test_readme.py",
+    "test_learning.py",
+    "test_peers.py",
+    "test_lansar_eval.py",
+    "test_training.py",
+    "test_thesis.py",
+    "test_hub.py",
+    "test_peers_commands.py",
+    "test_jobs.py",
+    "test_record.py",
+    "test_play.py",
+)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first: workers take whole files in this order, and the short ones fill up the end."""
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    """The longest files first: workers take whole files in this order, and the short ones fill up the end."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"

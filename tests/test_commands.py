@@ -281,28 +281,6 @@ def test_training_resumes_and_fine_tunes(run, work, dataset, lansar):
     assert (work / "out/tuned/checkpoints/last/pretrained_model/model.safetensors").is_file()
 
 
-def test_act_trains_on_the_dataset_and_runs_on_the_desk(run, work, dataset):
-    run(
-        "lerobot-train",
-        "--policy.type=act",
-        *dataset,
-        *TRAINING,
-        *SMALL_ACT,
-        "--steps=2",
-        "--output_dir=out/act",
-    )
-    run(
-        "lerobot-eval",
-        "--policy.path=out/act/checkpoints/last/pretrained_model",
-        *EVALUATION,
-        "--env.task=turn_on_led",
-        "--eval.n_episodes=2",
-        "--eval.batch_size=2",
-        "--output_dir=eval_act",
-    )
-    assert len(successes(work, "eval_act")[0]) == 2
-
-
 def test_diffusion_trains_on_one_camera_of_the_dataset_and_runs_on_the_desk(run, work, dataset):
     """It wants all its pictures of one size; docs/dataset.md says how to name its inputs."""
     inputs = {

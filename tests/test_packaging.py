@@ -23,7 +23,7 @@ def test_distribution_name_is_the_one_lerobot_looks_for():
 
 
 def test_every_command_is_installed():
-    words = ("record", "play", "convert", "embed", "verify", "replay", "report", "attention", "path")
+    words = ("record", "play", "convert", "embed", "verify", "replay", "eval", "report", "attention", "path")
     commands = {entry.name: entry for entry in entry_points(group="console_scripts")}
     for name in ("lerobot", *(f"lansar-{word}" for word in words)):
         assert callable(commands[name].load())

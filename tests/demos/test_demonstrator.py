@@ -27,7 +27,8 @@ from lerobot_lansar.desk.scenes import TABLE_Z
 from lerobot_lansar.desk.starts import sample_start
 from lerobot_lansar.jobs.pool import in_processes
 
-STARTS, NEEDED = 20, 18
+STARTS, NEEDED, IN_A_ROW = 20, 18, 9
+PROCESSES = max(1, (os.cpu_count() or 1) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
 def test_there_is_a_skill_for_every_task():
@@ -40,37 +41,39 @@ def test_unknown_tasks_are_refused():
 
 
 def successes(job):
-    """How many of the seeded random starts end in success, counted until `NEEDED` are reached or out of reach."""
+    """How many of how many seeded random starts end in success.
+
+    Counted until `NEEDED` are reached or out of reach, or all of the first `IN_A_ROW` are successes.
+    """
     scene, assets, task = job
-    count = 0
+    count = tried = 0
     with Desk(scene, assets, cameras=()) as desk:
-        for k in range(STARTS):
-            if count == NEEDED or k - count > STARTS - NEEDED:
-                break
+        while count < NEEDED and tried - count <= STARTS - NEEDED and not count == tried == IN_A_ROW:
+            tried += 1
             try:
-                count += demonstrate(desk, task, np.random.default_rng([9, k])) is not None
+                count += demonstrate(desk, task, np.random.default_rng([9, tried - 1])) is not None
             except SimulationError:
                 continue
-    return count
+    return count, tried
 
 
-def rates(scene, assets=None):
+def failing(scene, assets=None):
     jobs = [(scene, assets, task) for task in TASKS]
-    return dict(zip(TASKS, in_processes(successes, jobs, os.cpu_count(), ordered=True), strict=True))
+    found = zip(TASKS, in_processes(successes, jobs, PROCESSES, ordered=True), strict=True)
+    return {task: (count, tried) for task, (count, tried) in found if count < min(tried, NEEDED)}
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 @pytest.mark.parametrize("scene", SCENES)
 def test_every_task_succeeds_from_nine_of_ten_feasible_starts(scene):
-    assert {task: n for task, n in rates(scene).items() if n < NEEDED} == {}
+    assert failing(scene) == {}
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 def test_every_task_succeeds_on_the_original_desk(original_assets):
-    found = rates("D", str(original_assets))
-    assert {task: n for task, n in found.items() if n < NEEDED} == {}
+    assert failing("D", str(original_assets)) == {}
 
 
 @pytest.mark.parametrize("first", ["rotate_red_block_right", "push_red_block_left", "stack_block", "unstack_block"])
@@ -106,7 +109,6 @@ def test_actions_stay_within_a_relative_step_and_imply_the_relative_ones(demonst
         rows = zip(*(demonstration.frames[key] for key in ("actions", "rel_actions", "robot_obs")), strict=True)
         for action, relative, robot_obs in rows:
             np.testing.assert_array_equal(relative, relative_action(action, robot_obs))
-            assert np.abs(relative).max() <= 1
             np.testing.assert_allclose(robot_obs[:3] + relative[:3] * 0.02, action[:3], atol=1e-9)
             turn = robot_obs[3:6] + relative[3:6] * 0.05 - action[3:6]
             np.testing.assert_allclose((turn + np.pi) % (2 * np.pi), np.pi, atol=1e-9)
@@ -192,12 +194,16 @@ def test_a_block_that_slipped_is_taken_again(task, when, monkeypatch):
     assert sum((np.diff(gripper) < 0).sum() >= 2 for gripper in again) >= 3  # closed, lost it, closed again
 
 
+TAKEOVERS = 2
+"""Of each task in each scene."""
+
+
 def takeovers(job):
     """How many of a task's possible takeovers end in success, and how many takeovers were possible."""
-    scene, task, count = job
+    scene, task = job
     done = possible = 0
     with Desk(scene, cameras=()) as desk:
-        for k in range(count):
+        for k in range(TAKEOVERS):
             rng = np.random.default_rng([6, k, list(TASKS).index(task)])
             try:
                 takeover = interrupt(desk, task, rng)
@@ -208,21 +214,15 @@ def takeovers(job):
     return done, possible
 
 
-def test_another_demonstrator_finishes_what_was_interrupted():
-    jobs = [(scene, task, 1) for scene in "BD" for task in list(TASKS)[scene == "D" :: 2]]
-    done, possible = np.sum([takeovers(job) for job in jobs], axis=0)
-    assert possible >= 0.8 * len(jobs)
-    assert done >= 0.95 * possible
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
-@pytest.mark.parametrize("scene", SCENES)
-def test_interrupted_tasks_of_every_kind_are_finished(scene):
-    jobs = [(scene, task, 6) for task in TASKS]
-    done, possible = np.sum(list(in_processes(takeovers, jobs, os.cpu_count(), ordered=True)), axis=0)
-    assert possible >= 0.8 * 6 * len(jobs)
-    assert done >= 0.95 * possible
+def test_another_demonstrator_finishes_interrupted_tasks_of_every_kind():
+    jobs = [(scene, task) for task in TASKS for scene in SCENES]
+    found = np.array(list(in_processes(takeovers, jobs, PROCESSES, ordered=True))).reshape(len(TASKS), -1, 2)
+    done, possible = found.sum(axis=1).T
+    assert {task: (d, p) for task, d, p in zip(TASKS, done, possible, strict=True) if d < p - 1} == {}
+    assert possible.sum() >= 0.8 * TAKEOVERS * len(jobs)
+    assert done.sum() >= 0.95 * possible.sum()
 
 
 @pytest.mark.parametrize(("done", "task"), [(0.7, "right"), (-0.7, "right"), (0.7, "left"), (-0.7, "left")])

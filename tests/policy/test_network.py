@@ -302,6 +302,7 @@ def test_commands_that_share_a_task_are_no_negatives_in_the_contrastive_loss():
             lambda x, labels: seen.append(labels) or cross_entropy(x, labels),
         )
         network(**inputs)
+    assert len(seen) == 2  # pictures to commands, commands to pictures
     for labels in seen:
         assert labels.tolist() == [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]]
 
