@@ -10,7 +10,7 @@ LanSAR reads it, with LeRobot's own delta timestamps, and as a bare lookup in me
 
 Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, AdamW). PyTorch
 counts the FLOP; the ceiling is its product of 2048 x 2048 matrices (8192 x 8192 on a GPU) on the same device and dtype.
-On a GPU, one more update counts where the CPU waits for it (torch.cuda.set_sync_debug_mode). Without --root the data
+On a GPU, one more update tells where the CPU waits for it (torch.cuda.set_sync_debug_mode). Without --root the data
 are random demonstrations of 64 steps in a temporary folder.
 """
 
@@ -152,7 +152,7 @@ def waits(update: Callable[[], None]) -> list[str]:
             update()
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    return [f"{w.filename}:{w.lineno}" for w in found if "synchroniz" in str(w.message)]
+    return [f"{w.filename}:{w.lineno}" for w in found if "called a synchronizing" in str(w.message)]
 
 
 def updates(options: Options, variant: str, config: LanSARConfig, root: Path) -> dict[str, Any]:

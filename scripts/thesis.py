@@ -29,7 +29,8 @@ from lerobot_lansar.report.episodes import read_lines
 ROOT = Path(__file__).resolve().parents[1]
 PATH = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
 FRAMES_PER_CORE = {"state": 200, "pictures": 60}
-"""Frames that one core records in a second, start-up included."""
+"""Frames that one core records in a second, start-up included (docs/benchmarks.md: 224; docs/RESULTS.md, 2 h with
+pictures: 66)."""
 SHARES = {"record": 0.2, "evaluate": 0.25}
 """Shares of the time for recording and for both evaluations; training takes what is left."""
 START_UP = 100
@@ -279,7 +280,6 @@ class Thesis:
 
     def main(self) -> int:
         """All steps."""
-        self.out.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(1) as gpu:  # the GPU is idle while the cores record
             measuring = gpu.submit(self.measure)
             try:
@@ -311,7 +311,9 @@ def main() -> int:
     parser.add_argument("--device", default="cuda", help="for training")
     parser.add_argument("--eval_device", help="for evaluation; by default --device")
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one per core")
-    parser.add_argument("--output_dir", default="outputs/thesis_size")
+    parser.add_argument(
+        "--output_dir", help="by default outputs/thesis_size, with --pictures and --dry_run in its name"
+    )
     parser.add_argument("--dry_run", action="store_true", help="tiny sizes, on a CPU: whether every step works")
     options = parser.parse_args()
     if options.dataset and not (Path(options.dataset) / "meta/info.json").exists():
@@ -320,9 +322,16 @@ def main() -> int:
         options.device = "cpu"
         options.eval_device = "cpu"
     options.eval_device = options.eval_device or options.device
-    options.output_dir = Path(options.output_dir).resolve()
+    kind = {name: getattr(options, name) for name in ("pictures", "dry_run")}
+    default = "_".join(["outputs/thesis_size", *(name for name, on in kind.items() if on)])
+    options.output_dir = Path(options.output_dir or default).resolve()
+    begun = options.output_dir / "kind.json"
+    if begun.exists() and json.loads(begun.read_text()) != kind:
+        parser.error(f"--output_dir={begun.parent} holds a run with {begun.read_text()}: choose another folder")
     options.dataset = options.dataset and Path(options.dataset).resolve()
     os.chdir(ROOT)
+    begun.parent.mkdir(parents=True, exist_ok=True)
+    begun.write_text(json.dumps(kind))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that `run` ends its command, too
     return Thesis(options).main()
 

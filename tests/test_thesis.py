@@ -63,6 +63,14 @@ def test_the_whole_line_runs_without_a_network(tmp_path):
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert {name: found["chains"] for name, found in result["evaluations"].items()} == {"recommended": 2, "thesis": 2}
     assert (tmp_path / "out/report/report.html").is_file()
+    for name in ("recommended", "thesis"):
+        policy = json.loads((tmp_path / f"out/train/{name}/checkpoints/last/pretrained_model/config.json").read_text())
+        assert policy["use_images"]
+        assert policy["orientation"] == ("sincos" if name == "recommended" else "euler")
+    command.remove("--pictures")
+    refused = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert 'holds a run with {"pictures": true' in refused.stderr
     assert not asked.exists(), asked.read_text()
 
 
