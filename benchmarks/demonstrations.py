@@ -125,6 +125,8 @@ def main() -> None:
     """Measures what FILE does not hold yet and prints the table."""
     options = draccus.parse(Options)
     if options.chains:
+        if options.output is not None:
+            raise SystemExit("--output is for starts; with --chains the results are printed only: leave it out")
         report_chains(options)
         return
     state = code_and_options(options)

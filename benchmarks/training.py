@@ -8,10 +8,10 @@
 Reading: milliseconds of CPU per sample, a window of the preset's length (with picture embeddings if it uses them), as
 LanSAR reads it, with LeRobot's own delta timestamps, and as a bare lookup in memory-mapped arrays, the floor.
 
-Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, AdamW). PyTorch
-counts the FLOP; the ceiling is its product of 2048 x 2048 matrices (8192 x 8192 on a GPU) on the same device and dtype.
-On a GPU, one more update tells where the CPU waits for it (torch.cuda.set_sync_debug_mode). Without --root the data
-are random demonstrations of 64 steps in a temporary folder.
+Updates: the loop is lerobot-train's (LeRobotDataset, DataLoader, preprocessor, forward, backward, the preset's
+optimizer). PyTorch counts the FLOP; the ceiling is its product of 2048 x 2048 matrices (8192 x 8192 on a GPU) on the
+same device and dtype. On a GPU, one more update tells where the CPU waits for it (torch.cuda.set_sync_debug_mode).
+Without --root the data are random demonstrations of 64 steps in a temporary folder.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/desk.md.
+"""Draws the pictures of the desk in README.md and docs/desk.md.
 
 python scripts/draw_desks.py                 docs/images/desks.png: the built-in desks by both cameras
 python scripts/draw_desks.py --assets=DIR    docs/images/looks.jpg as well: all renderers

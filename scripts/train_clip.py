@@ -1,7 +1,7 @@
 """Trains lansar-desk, the small CLIP that comes with the package, on pictures of the desks and on commands.
 
     python scripts/train_clip.py record --assets=CALVIN_ENV/data    # pictures of all four desks
-    python scripts/train_clip.py train                              # writes the weights into the package
+    python scripts/train_clip.py train --output=FILE                # by default, the package's own weights
     python scripts/train_clip.py judge --sentences='[FILE.yaml]'    # what it understands and sees, on held-out data
 
 Four losses, summed:
@@ -14,8 +14,8 @@ Four losses, summed:
                             and the TCP (cross-entropy over the cells), which teaches it to look far sooner
 
 With --text=FILE the text encoder is that file's and stays as it is, so sentences keep their embeddings, and policies
-that were trained on them can go on. `record` continues an interrupted recording; one round of all desks and assets in
-ten is held out, which is of play.
+that were trained on them can go on. Without it every such policy loses its meaning, checkpoints/desk-d too. `record`
+continues an interrupted recording; one round of all desks and assets in ten is held out, which is of play.
 """
 
 import itertools

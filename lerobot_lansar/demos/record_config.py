@@ -117,7 +117,7 @@ class RecordConfig:
     assets: str | None = None
     # What draws the pictures: gl (the look of CALVIN's public data), tiny, pybullet_gl or pybullet_tiny.
     renderer: str = "gl"
-    # The policy that acts. Takeovers only, as the five options below.
+    # The policy that acts. Takeovers only, as the four options below.
     policy: TakeoverPolicy = field(default_factory=TakeoverPolicy)
     # What it observes, as in lansar-eval.
     env: TakeoverEnv = field(default_factory=TakeoverEnv)

@@ -77,7 +77,7 @@ class CalvinEnv(gym.Env):
         task: `"lh_mtlc"` or one of the 34 tasks.
         scene: `"A"`, `"B"`, `"C"` or `"D"`; the benchmark is defined on D.
         assets: `data` folder of a calvin_env checkout, or None for the built-in desk.
-        cameras: Pictures in the observation. Without any, an episode takes a half to a third of the time.
+        cameras: Pictures in the observation. Without any, a step takes a third to a fifth of the time.
         control_mode: `"rel"` or `"abs"`.
         steps_per_command: Control steps that a command may take.
         annotations: YAML file of sentences by task (CALVIN's format); our own by default.

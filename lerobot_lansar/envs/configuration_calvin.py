@@ -51,7 +51,7 @@ class CalvinEnvConfig(EnvConfig):
     scene: str = "D"
     # The data folder of a calvin_env checkout, to use CALVIN's own files; by default the built-in desk.
     assets: str | None = None
-    # Pictures in the observation: [static,gripper], one of them, or [] (two to three times as fast).
+    # Pictures in the observation: [static,gripper], one of them, or [] (three to five times as fast).
     cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
     # rel: actions are differences to a target pose, in units of 0.02 m and 0.05 rad; abs: the TCP's pose to go to.
     control_mode: str = "rel"
