@@ -44,7 +44,6 @@ benchmarks: install
 	.venv/bin/python benchmarks/desk.py --output=outputs/benchmarks/desk.json
 	$(if $(ASSETS),.venv/bin/python benchmarks/desk.py --assets=$(ASSETS) --output=outputs/benchmarks/desk_original.json)
 	.venv/bin/python benchmarks/recording.py --output=outputs/benchmarks/recording.json
-	.venv/bin/python benchmarks/demonstrations.py --output=outputs/benchmarks/demonstrations.json
 	.venv/bin/python benchmarks/convert.py --output=outputs/benchmarks/convert.json
 	.venv/bin/python benchmarks/latency.py --output=outputs/benchmarks/latency.json
 	.venv/bin/python benchmarks/training.py --output=outputs/benchmarks/training.json
