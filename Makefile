@@ -10,7 +10,7 @@ help:
 	@echo "make test         environment, all tests"
 	@echo "make install      environment only: .venv with the plugin installed editable"
 	@echo "make lint         ruff and mypy"
-	@echo "make benchmarks   the speed tables of docs/benchmarks.md; with ASSETS=DIR also those on CALVIN's files"
+	@echo "make benchmarks   speed of desk, recorder, converter, policy and training; ASSETS=DIR: on CALVIN's files too"
 	@echo "make clean        removes .venv, outputs and data/quickstart"
 
 install: .venv/.installed
