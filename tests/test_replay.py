@@ -155,7 +155,7 @@ def test_the_video_shows_recording_states_and_actions_side_by_side(filmed, tmp_p
     assert printed.count("fulfilled at frame") == 2
     with av.open(str(tmp_path / "window_000000.mp4")) as container:
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
-    assert len(frames) == len(FolderSource(filmed, "training").read(0, False))
+    assert len(frames) == len(FolderSource(filmed, "training").read(0, False)) + 1  # after the last action
     assert frames[0].shape == (68 + 400 + 168, 3 * 400, 3)
     recorded, states, actions = (frames[-1][68:468, left : left + 400] for left in (0, 400, 800))
     assert np.abs(recorded - states).mean() < 2

@@ -5,7 +5,6 @@ with one call. Imports LeRobot, which takes seconds; other modes of lansar-recor
 """
 
 import hashlib
-import os
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -38,6 +37,7 @@ from ..envs.spaces import EnvironmentState, observation_space, observe
 from ..evaluation.loading import load_policy
 from ..evaluation.rows import ResetAtCommands
 from ..evaluation.stream import Episode
+from ..jobs.pool import usable_cores
 from .calvin_folder import FrameWriter, Unit
 from .demonstrator import AFTERWARDS, Frame, carry_out
 from .moves import FALLEN
@@ -171,7 +171,7 @@ def _loaded(config: RecordConfig) -> Any:
             camera_poses=config.env.camera_poses,
             image_size=config.image_size,
         )
-        threads = max(1, len(os.sched_getaffinity(0)) // config.workers)
+        threads = max(1, usable_cores() // config.workers)
         torch.set_num_threads(min(torch.get_num_threads(), threads))
         _policies[key] = load_policy(_policy_config(config), env)
     return _policies[key]

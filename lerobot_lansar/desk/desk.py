@@ -40,6 +40,7 @@ class SavedState:
     assets: str
     robot_obs: np.ndarray | None
     scene_obs: np.ndarray
+    continued: bool
     actions: tuple[tuple[np.ndarray, str], ...]
 
 
@@ -129,6 +130,7 @@ class Desk:
         robot_obs: Sequence[float] | np.ndarray | None = None,
         scene_obs: Sequence[float] | np.ndarray | None = None,
         seed: int | None = 0,
+        continued: bool = False,
     ) -> Observation:
         """Puts the desk into a state; nothing that happened before has any influence.
 
@@ -138,6 +140,8 @@ class Desk:
             scene_obs: (24,) with blocks in red, blue, pink order; None: everything closed and off, blocks at random
                 as in CALVIN, or where the scene's layout puts them.
             seed: Determines the blocks' random poses; None: different ones every time.
+            continued: The state is from the middle of an episode, so a button that is down has already toggled the
+                LED. Otherwise it does so in the first step, as in CALVIN.
 
         Returns:
             The observation after one simulation step, as in CALVIN.
@@ -152,8 +156,8 @@ class Desk:
             self.close()
             self._open()
         self._clear_contacts()
-        self._put(robot_state, scene_state)
-        self._history = SavedState(self.scene.name, self.assets, robot_state, scene_state, ())
+        self._put(robot_state, scene_state, continued)
+        self._history = SavedState(self.scene.name, self.assets, robot_state, scene_state, continued, ())
         self._actions = []
         return self.observe()
 
@@ -197,7 +201,7 @@ class Desk:
                 f"the state was saved in scene {state.scene} with {state.assets} assets; this desk is scene "
                 f"{self.scene.name} with {self.assets} assets"
             )
-        self.reset(state.robot_obs, state.scene_obs)
+        self.reset(state.robot_obs, state.scene_obs, continued=state.continued)
         for action, control_mode in state.actions:
             self._advance(action, control_mode)
         return self.observe()
@@ -312,8 +316,8 @@ class Desk:
             p.stepSimulation(physicsClientId=self._client)
         self._furniture.update_lights()
 
-    def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray) -> None:
-        self._furniture.reset(scene_state[FURNITURE])
+    def _put(self, robot_state: np.ndarray | None, scene_state: np.ndarray, continued: bool) -> None:
+        self._furniture.reset(scene_state[FURNITURE], continued)
         for index, color in enumerate(COLORS):
             pose = scene_state[block_pose(index)]
             self._blocks[color].place(pose[:3], pose[3:])

@@ -51,21 +51,27 @@ class Furniture:
         indices = [self._joints[name] for name in JOINTS]
         return [state[0] for state in p.getJointStates(self.body, indices, physicsClientId=self.client)]
 
-    def reset(self, state: np.ndarray) -> None:
-        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the first part of `scene_obs`."""
+    def reset(self, state: np.ndarray, continued: bool = False) -> None:
+        """Sets slide, drawer, button, switch (m), bulb and LED (0/1): (6,), the first part of `scene_obs`.
+
+        With `continued`, lights have already followed a button that is down and a switch that is on.
+        """
         for name, value in zip(JOINTS, state[:4], strict=True):
             p.resetJointState(self.body, self._joints[name], value, physicsClientId=self.client)
         self.bulb, self.led = bool(state[4] > 0.5), bool(state[5] > 0.5)
-        self._was_pressed = self._was_on = False
+        self._was_pressed, self._was_on = (continued and is_down for is_down in self._are_down())
+
+    def _are_down(self) -> tuple[bool, bool]:
+        """Whether the button is pressed and whether the switch is on."""
+        _, _, button, switch = self.joints()
+        return button > BUTTON_TRAVEL / 2, switch > SWITCH_TRAVEL / 2
 
     def update_lights(self) -> None:
         """A new press of the button toggles the LED, a moved switch sets the bulb; to be called every control step."""
-        _, _, button, switch = self.joints()
-        pressed = button > BUTTON_TRAVEL / 2
+        pressed, on = self._are_down()
         if pressed and not self._was_pressed:
             self.led = not self.led
         self._was_pressed = pressed
-        on = switch > SWITCH_TRAVEL / 2
         if on != self._was_on:
             self.bulb = on
         self._was_on = on

@@ -337,7 +337,7 @@ class CalvinEnv(gym.Env):
 
         A command's `done` is the commanded task if it was fulfilled. Else it is the task that was fulfilled first
         (looked for every `_LOOK_EVERY` steps; of several the first in alphabetical order), or null. `end` is the state
-        in which the episode ended; `Desk.reset` takes it.
+        in which the episode ended; `Desk.reset(…, continued=True)` goes on from it.
         """
         assert self._desk is not None
         return {

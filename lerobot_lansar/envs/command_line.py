@@ -1,7 +1,6 @@
 """Mistakes that show only in the options of the running LeRobot command, of which LeRobot tells an environment nothing.
 
-The options are read with LeRobot's own functions, from the command line. Those in a file of `--config_path` are not
-seen, except the policy's path and what decides whether a new policy reads the scene's state.
+The options are read as LeRobot reads them, from the command line or else from the file of `--config_path`.
 """
 
 import json
@@ -10,6 +9,7 @@ from typing import Any
 
 import yaml
 from huggingface_hub import hf_hub_download
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import DEFAULT_DEPTH_UNIT, PreTrainedConfig, parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
@@ -32,7 +32,7 @@ def refuse_recording(mixed: bool, depth: bool) -> None:
     Raises:
         CommandError: The command records.
     """
-    if (parser.parse_arg("eval.recording") or "false").lower() == "false":
+    if str(_option("eval.recording") or False).lower() == "false":
         return
     if mixed:
         raise CommandError(
@@ -104,9 +104,19 @@ def trained_depth_unit() -> str:
     A training command's own `--dataset.depth_output_unit`, or that of the training that made `--policy.path`.
     """
     policy, option = parser.get_path_arg("policy"), "depth_output_unit"
-    if parser.parse_arg("dataset.repo_id") is not None or policy is None:
-        return parser.parse_arg(f"dataset.{option}") or DEFAULT_DEPTH_UNIT
-    return _training_of(policy).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
+    if _option("dataset.repo_id") is not None or policy is None:
+        return _option(f"dataset.{option}") or DEFAULT_DEPTH_UNIT
+    return _file_beside(policy, TRAIN_CONFIG_NAME).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
+
+
+def wanted_device() -> str | None:
+    """The device that the command or its policy's own configuration names, whether or not this machine has it.
+
+    LeRobot replaces a device that is missing here by another, although jobs may run on machines that have it.
+    """
+    policy = parser.get_path_arg("policy")
+    named = _option("policy.device")
+    return named or (None if policy is None else _file_beside(policy, CONFIG_NAME).get("device"))
 
 
 def evaluated_policy() -> str | None:
@@ -114,19 +124,19 @@ def evaluated_policy() -> str | None:
 
     None in a training too, which evaluates what it has made of that policy so far.
     """
-    policy = None if parser.parse_arg("dataset.repo_id") is not None else parser.get_path_arg("policy")
+    policy = None if _option("dataset.repo_id") is not None else parser.get_path_arg("policy")
     if policy is None or not Path(policy).is_dir():
         return policy
     folder = Path(policy).resolve()  # `checkpoints/last` is another folder tomorrow
     return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
 
 
-def _training_of(policy: str) -> dict[str, Any]:
-    """The options with which LeRobot trained a policy, from the file that it keeps beside it; empty without one."""
-    file = Path(policy, TRAIN_CONFIG_NAME)
+def _file_beside(policy: str, name: str) -> dict[str, Any]:
+    """A JSON file beside a policy's weights, in a folder or on the hub; empty without one."""
+    file = Path(policy, name)
     if not Path(policy).is_dir():
         try:
-            file = Path(hf_hub_download(policy, TRAIN_CONFIG_NAME))
+            file = Path(hf_hub_download(policy, name))
         except (OSError, ValueError):  # no such file there, or no hub
             return {}
     return json.loads(file.read_text()) if file.is_file() else {}
@@ -146,25 +156,26 @@ def _trained_shapes() -> dict[str, tuple[int, ...]]:
     Known for `--policy.path`, and for a dataset on this machine that a new policy is trained on. The second number of
     a picture's shape is its height in both.
     """
-    policy, dataset = parser.get_path_arg("policy"), parser.parse_arg("dataset.repo_id")
+    policy, dataset = parser.get_path_arg("policy"), _option("dataset.repo_id")
     if policy is not None:
         return shapes_read(PreTrainedConfig.from_pretrained(policy))
     if dataset is None:
         return {}
-    root = parser.parse_arg("dataset.root")
+    root = _option("dataset.root")
     try:
         file = find_dataset(dataset, None if root is None else Path(root)) / "meta/info.json"
         features = json.loads(file.read_text())["features"]
     except FileNotFoundError:
         return {}
-    spatial = str(_policy_option("use_spatial_context")).lower() != "false"
-    ignored = () if reads_scene(_policy_option("type"), spatial) else (OBS_ENV_STATE,)
+    spatial = str(_option("policy.use_spatial_context")).lower() != "false"
+    ignored = () if reads_scene(_option("policy.type"), spatial) else (OBS_ENV_STATE,)
     return {key: tuple(feature["shape"]) for key, feature in features.items() if key not in ignored}
 
 
-def _policy_option(name: str) -> Any:
-    """The value of a new policy's option, from the command line or else from the file of `--config_path`; or None."""
-    value, file = parser.parse_arg(f"policy.{name}"), parser.parse_arg("config_path")
+def _option(name: str) -> Any:
+    """The value of an option such as `policy.type`; None if neither command line nor `--config_path` has it."""
+    value, file = parser.parse_arg(name), parser.parse_arg("config_path")
     if value is not None or file is None or not Path(file).is_file():
         return value
-    return (yaml.safe_load(Path(file).read_text()).get("policy") or {}).get(name)
+    section, _, key = name.partition(".")
+    return ((yaml.safe_load(Path(file).read_text()) or {}).get(section) or {}).get(key)

@@ -24,6 +24,7 @@ from ..clip.store import sha256
 from ..command import CommandError, run_command
 from ..envs.command_line import evaluated_policy
 from ..jobs.executors import run_shards
+from ..jobs.pool import usable_cores
 from ..jobs.staging import end_submitted, refuse_submitted, submitted_jobs, write_atomically
 from ..report.episodes import INFO_FILE, PLAN_FILE, read_lines
 from ..report.episodes import Episode as Played
@@ -70,8 +71,7 @@ def _evaluate(config: EvaluateConfig) -> Path:
     folder, desk = config.folder, config.desk
     env_options = desk.gym_kwargs
     env_options["results_extra"] = {**env_options["results_extra"], "policy_reset": "command"}
-    seconds = _claim(config)
-    _make_paths_absolute(config, env_options)
+    before = _earlier(config)
     episodes = planned(config)
     done = {episode.key for episode in read_lines(folder)}
     missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
@@ -82,7 +82,13 @@ def _evaluate(config: EvaluateConfig) -> Path:
     info.unlink(missing_ok=True)  # of an evaluation with fewer or more episodes
     config.workers = min(config.workers or 1, max(1, len(missing)))
     executor = config.executor if missing else "local"
-    started, tally = time.time() - seconds, _Tally(config)
+    described = _described(config)
+    if before and not missing:
+        described |= {key: before[key] for key in ("command", "hardware", "seconds")}
+    write_atomically(folder / PLAN_FILE, json.dumps(described, indent=2) + "\n")
+    _make_paths_absolute(config, env_options)
+    seconds = before.get("seconds", 0.0)  # None: a run was killed, or jobs played
+    started, tally = time.time() - (seconds or 0.0), _Tally(config)
     try:
         with submitted_jobs(folder / _STATE, submitting=executor == "slurm"):
             complete = run_shards(
@@ -100,7 +106,7 @@ def _evaluate(config: EvaluateConfig) -> Path:
                 status=lambda: _mean(tally(), desk.suites()),
             )
     finally:
-        if executor != "slurm":
+        if executor != "slurm" and seconds is not None and missing:
             _note_seconds(folder, time.time() - started)
     if not complete:
         print(f"submitted; {folder / INFO_FILE} appears when the jobs are done")
@@ -113,6 +119,7 @@ def _make_paths_absolute(config: EvaluateConfig, env_options: dict[str, Any]) ->
     for name in ("assets", "annotations"):
         if env_options[name] is not None:
             env_options[name] = str(Path(env_options[name]).resolve())
+            setattr(config.desk, name, env_options[name])
     assert config.policy is not None
     path = Path(str(config.policy.pretrained_path))
     if path.is_dir():
@@ -162,41 +169,42 @@ def _mean(episodes: list[Played], suites: dict[str, tuple[str, ...]]) -> str:
     return f"average length {mean:.2f}" if len(suites) == 1 else f"{mean:.2f} commands an episode"
 
 
-def _claim(config: EvaluateConfig) -> float:
-    """Makes the folder that of this evaluation, for the next run and for `lansar-report`.
-
-    Returns:
-        How many seconds earlier runs have taken.
+def _earlier(config: EvaluateConfig) -> dict[str, Any]:
+    """What earlier runs of this evaluation left in its folder, empty if there were none.
 
     Raises:
-        CommandError: It is that of another one.
+        CommandError: The folder is that of another evaluation.
     """
     file = config.folder / PLAN_FILE
-    request, seconds = _request(config), 0.0
     if file.exists() and read_lines(config.folder):
-        before = json.loads(file.read_text())
-        if before["request"] != request:
-            others = ", ".join(_differences(before["request"], request))
+        before: dict[str, Any] = json.loads(file.read_text())
+        others = ", ".join(_differences(before["request"], _request(config)))
+        if others:
             raise CommandError(
                 f"{config.folder} holds another evaluation, which differs in {others}: give another --output_dir, or "
                 f"repeat its options ({file})"
             )
-        seconds = before.get("seconds") or 0.0
-    elif not file.exists() and any((config.folder / name).exists() for name in (EPISODES_FILE, INFO_FILE)):
+        return before
+    if not file.exists() and any((config.folder / name).exists() for name in (EPISODES_FILE, INFO_FILE)):
         raise CommandError(f"{config.folder} holds another evaluation: give another --output_dir")
-    described = {
+    return {}
+
+
+def _described(config: EvaluateConfig) -> dict[str, Any]:
+    """This evaluation, for the next run and for `lansar-report`. How long it takes is not known yet."""
+    local = config.executor == "local"
+    where = f"{usable_cores()} CPU cores" if local else f"{config.workers} jobs of {config.executor}"
+    return {
         "policy": evaluated_policy(),
         "seed": config.seed,
         "n_episodes": config.eval.n_episodes,
         "suites": config.desk.suites(),
         "command": shlex.join(["lansar-eval", *sys.argv[1:]]),
-        "hardware": f"{len(os.sched_getaffinity(0))} CPU cores, policy on {config.policy and config.policy.device}",
-        "seconds": seconds,
+        "hardware": f"{where}, policy on {config.policy and config.policy.device}",
+        "seconds": None,
         "version": version("lerobot_policy_lansar"),
-        "request": request,
+        "request": _request(config),
     }
-    write_atomically(file, json.dumps(described, indent=2) + "\n")
-    return seconds
 
 
 def _note_seconds(folder: Path, seconds: float) -> None:
@@ -210,9 +218,9 @@ def _request(config: EvaluateConfig) -> dict[str, Any]:
     options = {key: value for key, value in draccus.encode(config).items() if key not in _MAY_CHANGE}
     options["env"] = {key: value for key, value in options["env"].items() if key not in _ENV_MAY_CHANGE}
     assert config.policy is not None
-    options["policy"] |= {"pretrained_path": evaluated_policy()}
     files = sorted(Path(str(config.policy.pretrained_path)).glob("*.safetensors"))
     options["weights of the policy"] = {file.name: sha256(file) for file in files}
+    options["policy"] |= {"pretrained_path": None if files else evaluated_policy()}  # a folder is known by its weights
     if config.desk.annotations is not None:
         options["env"]["annotations"] = sha256(Path(config.desk.annotations))
     return json.loads(json.dumps(options))

@@ -1,6 +1,5 @@
 """The options of `lansar-eval`: those of `lerobot-eval`, and how the work is divided."""
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,8 +8,10 @@ from lerobot.configs.eval import EvalPipelineConfig
 
 from ..benchmark import LH_MTLC
 from ..command import CommandError
+from ..envs.command_line import wanted_device
 from ..envs.configuration_calvin import CalvinEnvConfig
 from ..jobs.executors import check_executor
+from ..jobs.pool import usable_cores
 from ..jobs.work import SlurmConfig
 
 
@@ -50,9 +51,11 @@ class EvaluateConfig(EvalPipelineConfig):
         if self.output_dir is None:
             raise CommandError("give --output_dir: an interrupted evaluation goes on in it")
         super().__post_init__()
+        if self.policy is not None and self.executor != "local":
+            self.policy.device = wanted_device() or self.policy.device
         if self.workers is None:
             on_cpu = self.policy is None or self.policy.device in (None, "cpu")
-            self.workers = len(os.sched_getaffinity(0)) if on_cpu else 1
+            self.workers = usable_cores() if on_cpu else 1
         if self.chains is not None:
             self.eval.n_episodes = self.chains
 

@@ -27,10 +27,11 @@ class Stream(Protocol):
 class ResetAtCommands(nn.Module):
     """A policy in LeRobot's `rollout`, which itself resets a policy once per batch of episodes.
 
-    LanSAR keeps a history for each environment and can clear one of them (`reset_environments`); it computes the same
-    for each in any batch of at least `least_rows`, so smaller ones are filled up with copies. Other policies keep
-    one queue of predicted actions for the whole batch: each environment gets a copy of its own, which shares the
-    weights, and a random generator of its own, so that what a copy does depends on its episode alone.
+    LanSAR keeps a history for each environment and can clear one of them (`reset_environments`). It computes the same
+    for each in any batch of at least `least_rows` that is a multiple of 4 (the last rows of others can differ in
+    rounding), so others are filled up with copies. Other policies keep one queue of predicted actions for the whole
+    batch: each environment gets a copy of its own, which shares the weights, and a random generator of its own, so that
+    what a copy does depends on its episode alone.
 
     Args:
         policy: In evaluation mode.
@@ -58,7 +59,8 @@ class ResetAtCommands(nn.Module):
         new = [i for i, stream in enumerate(self._streams) if stream.commands != self._begun[i]]
         self._begun = [stream.commands for stream in self._streams]
         if self._in_batch:
-            rows = [*range(environments), *[0] * (self._policy.least_rows - environments)]  # type: ignore[operator]
+            wanted = max(self._policy.least_rows, environments + -environments % 4)  # type: ignore[call-overload]
+            rows = [*range(environments), *[0] * (wanted - environments)]
             self._policy.reset_environments(k for k, i in enumerate(rows) if i in new)  # type: ignore[operator]
             return self._policy.select_action(_rows(batch, rows, environments))[:environments]
         for i in new:

@@ -1,7 +1,6 @@
 """One process of `lansar-eval`: LeRobot's `rollout` over its share of the episodes."""
 
 import logging
-import os
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stderr, redirect_stdout
 
@@ -13,6 +12,7 @@ from lerobot.utils.random_utils import set_seed
 
 from ..envs import CalvinEnv
 from ..envs.vector import SerialVectorEnv
+from ..jobs.pool import usable_cores
 from ..report.episodes import read_lines
 from .loading import load_policy
 from .options import EvaluateConfig
@@ -50,7 +50,7 @@ def _evaluate(config: EvaluateConfig, env_options: dict, episodes: list[Episode]
     logging.getLogger().setLevel(logging.WARNING)
     device = get_safe_torch_device(str(config.policy.device))
     if config.executor == "local":
-        threads = max(1, len(os.sched_getaffinity(0)) // config.workers)
+        threads = max(1, usable_cores() // config.workers)
         torch.set_num_threads(min(torch.get_num_threads(), threads))
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True

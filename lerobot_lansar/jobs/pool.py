@@ -14,6 +14,13 @@ from typing import Any
 from .work import WorkerDied
 
 
+def usable_cores() -> int:
+    """How many CPU cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1  # macOS
+
+
 def in_processes[Item, Result](
     work: Callable[[Item], Result], items: Sequence[Item], workers: int, ordered: bool = False
 ) -> Iterator[Result]:

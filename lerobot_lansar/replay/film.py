@@ -20,6 +20,8 @@ _BACKGROUND, _TEXT, _FAINT, _GOOD = (24, 26, 30), (220, 220, 220), (150, 150, 15
 def pictures(recording: Recording, outcomes: dict[str, Outcome]) -> Iterator[np.ndarray]:
     """One picture per frame: a column for the recorded pictures, if there are any, and one for each replay.
 
+    After actions comes one more, of the state after the last one; what is not known of it stays as in the last frame.
+
     Args:
         recording: What was replayed.
         outcomes: Column's heading to how a replay went, with pictures of both cameras.
@@ -28,7 +30,7 @@ def pictures(recording: Recording, outcomes: dict[str, Outcome]) -> Iterator[np.
         (height, width, 3) uint8, both numbers even.
     """
     columns = len(outcomes) + bool(recording.pictures)
-    for frame in range(len(recording)):
+    for frame in range(length(recording, outcomes)):
         canvas = Image.new("RGB", (_WIDTH * columns, _TOP + _WIDTH + _LOWER), _BACKGROUND)
         draw = ImageDraw.Draw(canvas)
         what = f"{recording.task or 'no task'}: {recording.sentence}"
@@ -38,7 +40,10 @@ def pictures(recording: Recording, outcomes: dict[str, Outcome]) -> Iterator[np.
         left = 0
         if recording.pictures:
             _draw_column(
-                canvas, left, "recorded", {camera: shown[frame] for camera, shown in recording.pictures.items()}
+                canvas,
+                left,
+                "recorded",
+                {camera: shown[min(frame, len(shown) - 1)] for camera, shown in recording.pictures.items()},
             )
             left += _WIDTH
         for heading, outcome in outcomes.items():
@@ -47,6 +52,11 @@ def pictures(recording: Recording, outcomes: dict[str, Outcome]) -> Iterator[np.
             _draw_state(draw, left + _LOWER + 14, recording.task, outcome, frame)
             left += _WIDTH
         yield np.asarray(canvas)
+
+
+def length(recording: Recording, outcomes: dict[str, Outcome]) -> int:
+    """How many pictures `pictures` makes."""
+    return max(len(recording), *(len(outcome.observations) for outcome in outcomes.values()))
 
 
 @cache
@@ -66,8 +76,9 @@ def _draw_column(canvas: Image.Image, left: int, heading: str, shown: dict[str, 
 def _draw_state(draw: ImageDraw.ImageDraw, left: int, task: str, outcome: Outcome, frame: int) -> None:
     """Draws the deviations of a frame and the verdict so far, beside the gripper camera's picture."""
     top = _TOP + _WIDTH + 12
-    if frame < len(outcome.deviations):
-        for line, (measure, value) in enumerate(zip(MEASURES, outcome.deviations[frame], strict=True)):
+    if frame < len(outcome.deviations) or not outcome.diverged:
+        compared = outcome.deviations[min(frame, len(outcome.deviations) - 1)]
+        for line, (measure, value) in enumerate(zip(MEASURES, compared, strict=True)):
             what, _, unit = measure.rpartition(" ")
             draw.text((left, top + 22 * line), f"{what}  {value:.1f} {unit}", _FAINT, _font(15))
     else:

@@ -59,7 +59,7 @@ def carry_out_actions(desk: Desk, recording: Recording, control_mode: str) -> Ou
         raise CommandError(f"{recording.name} holds no actions of --control_mode={control_mode}")
 
     def observations() -> Iterator[Observation]:
-        yield desk.reset(recording.robot_obs[0], recording.scene_obs[0])
+        yield desk.reset(recording.robot_obs[0], recording.scene_obs[0], continued=True)
         for action in recording.actions[control_mode]:
             yield desk.step(action, control_mode)
 

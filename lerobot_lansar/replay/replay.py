@@ -156,7 +156,8 @@ def replay(config: ReplayConfig) -> list[Replay]:
 
 def _write_video(path: Path, recording: Recording, outcomes: dict[str, Outcome]) -> None:
     with Video(path) as video:
-        for picture in tqdm(film.pictures(recording, outcomes), total=len(recording), desc=path.name, leave=False):
+        total = film.length(recording, outcomes)
+        for picture in tqdm(film.pictures(recording, outcomes), total=total, desc=path.name, leave=False):
             video.add(picture)
 
 

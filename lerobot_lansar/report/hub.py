@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ..benchmark import LH_MTLC
-from ..calvin import TASK_GROUPS
+from ..calvin import TASK_GROUPS, TASKS
 from ..command import CommandError
 from .figures import share
+from .notes import off_protocol
 
 SOURCE = "lerobot_policy_lansar"
 """Name of the source in every entry of ours; by it a later push finds them."""
@@ -41,7 +42,7 @@ def model_index(row: dict[str, Any], name: str) -> list[dict[str, Any]]:
         # The hub groups entries by type and configuration: both tell the desk.
         "dataset_type": "calvin" if assets == "original" else "calvin-built-in-desk",
         "dataset_name": f"{what}, scene {row['settings']['scene'] or 'unknown'} ({desk})",
-        "dataset_config": f"{LH_MTLC if chains else 'tasks'}, {assets or 'unknown'} assets",
+        "dataset_config": _configuration(row),
         "dataset_args": protocol(row),
         "source_name": SOURCE,
         "source_url": SOURCE_URL,
@@ -49,6 +50,15 @@ def model_index(row: dict[str, Any], name: str) -> list[dict[str, Any]]:
     results = [EvalResult(metric_type=kind, metric_name=text, metric_value=value, metric_args=extra, **common)  # type: ignore[arg-type]
                for kind, text, value, extra in _metrics(row)]  # fmt: skip
     return eval_results_to_model_index(name, results)
+
+
+def _configuration(row: dict[str, Any]) -> str:
+    """What evaluations must share for the later one to replace the earlier one in the card."""
+    chains = row["kind"] != "single tasks"
+    tasks = LH_MTLC if chains else "all tasks" if len(row["tasks"]) == len(TASKS) else ", ".join(sorted(row["tasks"]))
+    planned = row["episodes"] + (row["missing"] or 0)
+    assets = f"{row['settings']['assets'] or 'unknown'} assets"
+    return ", ".join([tasks, assets, f"{planned} {'chains' if chains else 'episodes'}", *off_protocol(row)])
 
 
 def _metrics(row: dict[str, Any]) -> list[tuple[str, str, float, dict[str, Any] | None]]:
@@ -139,7 +149,7 @@ def push(repo_id: str, row: dict[str, Any]) -> None:
 
 
 def merge_index(old: Any, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A card's `model-index` with our results in it: those of another desk or kind, and all others, stay.
+    """A card's `model-index` with our results in it: those of other tasks, assets or settings, and all others, stay.
 
     Args:
         old: What the card has; None if it has none.

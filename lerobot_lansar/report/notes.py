@@ -105,14 +105,19 @@ def _episodes(row: dict[str, Any], chains_known: bool) -> list[str]:
         notes.append("Success of each task is over chains and single tasks together; in a row is over chains only.")
     elif row["episodes"] < len(load_chains()):
         notes.append(f"{row['episodes']} of the benchmark's {len(load_chains())} chains.")
-    other = [
+    other = off_protocol(row)
+    if other:
+        notes.append(f"Not CALVIN's protocol: {', '.join(other)}.")
+    return notes
+
+
+def off_protocol(row: dict[str, Any]) -> list[str]:
+    """The settings of an evaluation that are not those of CALVIN's benchmark, such as "sentence random"."""
+    return [
         f"{key.replace('_', ' ')} {row['settings'][key]}"
         for key, value in PROTOCOL.items()
         if row["settings"][key] not in (None, value)
     ]
-    if other:
-        notes.append(f"Not CALVIN's protocol: {', '.join(other)}.")
-    return notes
 
 
 def grouped(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:

@@ -108,6 +108,13 @@ def test_a_reset_sets_the_gripper_command_and_forgets_that_the_button_was_presse
         assert desk.step(ZERO)["scene_obs"][LED] == 1
         desk.reset(None, obs["scene_obs"])
         assert desk.step(ZERO)["scene_obs"][LED] == 0
+    for led in (0, 1):  # unless the state is from the middle of an episode
+        pressed[LED] = led
+        desk.reset(None, pressed, continued=True)
+        saved = desk.save()
+        assert desk.step(ZERO)["scene_obs"][LED] == led
+        desk.restore(saved)
+        assert desk.step(ZERO)["scene_obs"][LED] == led
 
 
 def test_a_reset_uses_joints_and_opening_width_and_ignores_the_tcp_pose(desk):

@@ -18,6 +18,7 @@ from lerobot_lansar.desk import Desk
 from lerobot_lansar.envs import CalvinEnv
 from lerobot_lansar.envs.configuration_calvin import CalvinEnvConfig
 from lerobot_lansar.envs.pictures import Pictures
+from lerobot_lansar.evaluation.options import EvaluateConfig
 from lerobot_lansar.pictures import resize
 
 EVERYTHING = {"depth": True, "camera_poses": True, "image_size": 128}
@@ -110,7 +111,10 @@ def test_depth_has_the_unit_in_which_the_policy_was_trained(tmp_path, monkeypatc
     config = CalvinEnvConfig(depth=True)
     evaluation = policy(tmp_path, static_depth=[1, 200, 200])
     training = ["lerobot-train", "--policy.type=act", "--dataset.repo_id=you/desk"]
+    resumed = tmp_path / "resumed.json"
+    resumed.write_text(json.dumps({"dataset": {"repo_id": "you/desk", "depth_output_unit": "m"}}))
     for arguments, unit in (
+        (["lerobot-train", f"--config_path={resumed}", "--resume=true"], "m"),
         (evaluation, "mm"),
         (training, "mm"),
         ([*training, "--dataset.depth_output_unit=m"], "m"),
@@ -122,6 +126,17 @@ def test_depth_has_the_unit_in_which_the_policy_was_trained(tmp_path, monkeypatc
     monkeypatch.setattr(sys, "argv", evaluation)
     assert config.gym_kwargs["depth_unit"] == "m"
     assert CalvinEnvConfig(depth=True, depth_unit="mm").gym_kwargs["depth_unit"] == "mm"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")
+def test_jobs_run_on_the_device_that_is_wanted_even_if_this_machine_lacks_it(tmp_path, monkeypatch):
+    arguments = policy(tmp_path)
+    for config, option, device in (("cuda", [], "cuda"), ("cuda", ["--policy.device=cpu"], "cpu")):
+        (tmp_path / "config.json").write_text(json.dumps({"type": "act", "device": config}))
+        monkeypatch.setattr(sys, "argv", [*arguments, *option])
+        options = {"env": CalvinEnvConfig(), "output_dir": tmp_path}
+        assert EvaluateConfig(**options, executor="slurm").policy.device == device
+        assert EvaluateConfig(**options, executor="local").policy.device == "cpu"  # LeRobot's choice
 
 
 def test_pictures_unlike_the_policys_are_named_before_the_first_step(tmp_path, monkeypatch):

@@ -105,6 +105,7 @@ def test_the_lines_say_what_was_evaluated(checkpoint, undisturbed):
     assert (described["policy"], described["seed"], described["n_episodes"]) == (str(checkpoint), 4, 8)
     assert described["suites"] == {"lh_mtlc": ["lh_mtlc"]}
     assert described["command"].startswith("lansar-eval --policy.path=")
+    assert described["request"]["policy"]["pretrained_path"] is None, "its weights are known, wherever they lie"
 
 
 @pytest.mark.parametrize("executor", ["slurm", "ray"])

@@ -128,7 +128,7 @@ def test_an_entry_tells_the_protocol(tmp_path):
     assert len(names) == 7
 
 
-def test_original_and_built_in_desks_are_different_datasets(tmp_path):
+def test_evaluations_of_other_desks_and_settings_are_different_datasets(tmp_path):
     ours = results_of(write_lines(tmp_path / "ours", [chain_line(0, 2)]))
     calvin = results_of(write_lines(tmp_path / "calvin", [chain_line(0, 2)], assets="original"))
     unknown = results_of(write_lines(tmp_path / "unknown", [chain_line(0, 2)], assets=None))
@@ -136,8 +136,13 @@ def test_original_and_built_in_desks_are_different_datasets(tmp_path):
     assert ours[0]["dataset"]["type"] == unknown[0]["dataset"]["type"] == "calvin-built-in-desk"
     assert "CALVIN's original assets" in calvin[0]["dataset"]["name"]
     assert "unknown desk, not comparable with CALVIN" in unknown[0]["dataset"]["name"]
-    both = merge_index([{"name": "policy", "results": ours}], [{"name": "policy", "results": calvin}])
-    assert len(both[0]["results"]) == 2, "one does not replace the other"
+    disturbed = results_of(write_lines(tmp_path / "disturbed", [chain_line(0, 2)], perturbation_every=5))
+    more = results_of(write_lines(tmp_path / "more", [chain_line(k, 2) for k in range(2)]))
+    again = results_of(write_lines(tmp_path / "again", [chain_line(0, 3)]))
+    index: list = []
+    for results in (ours, calvin, disturbed, more, again):
+        index = merge_index(index, [{"name": "policy", "results": results}])
+    assert index[0]["results"] == [*calvin, *disturbed, *more, *again], "only the same is replaced"
 
 
 def test_single_tasks_are_pushed_as_a_whole_and_by_group(tmp_path):
