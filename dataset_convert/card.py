@@ -123,7 +123,7 @@ def describe(manifest: dict[str, Any], info: dict[str, Any], clip: dict[str, Any
 
 With LeRobot and the plugin lerobot_policy_lansar installed beside it:
 
-{_commands(request, clip, repo_id)}
+{_commands(request, manifest["look"]["image_size"], clip, repo_id)}
 """
 
 
@@ -250,10 +250,10 @@ def _lang(request: dict[str, Any]) -> str:
     )
 
 
-def _commands(request: dict[str, Any], clip: dict[str, Any] | None, repo_id: str) -> str:
-    size = f" --env.image_size={request['image_size']}" if request.get("image_size") else ""
+def _commands(request: dict[str, Any], size: int, clip: dict[str, Any] | None, repo_id: str) -> str:
     scene = "" if request.get("scene_state", True) else " --env.scene_state=false"
-    cameras = " --env.cameras='[]'" if request["images"] == "none" else size
+    seen = f" --env.image_size={size}" if size else ""  # the pictures' own size: the recording may have had it already
+    cameras = " --env.cameras='[]'" if request["images"] == "none" else seen
     cameras += " --env.depth=true" if request["depth"] else ""
     cameras += " --env.camera_poses=true" if request.get("camera_poses") else ""
     if request.get("task_in_state"):  # for policies that read no language; LanSAR refuses such a dataset
@@ -280,7 +280,7 @@ pictures (`--embed=true`, or `lansar-embed`) and `--policy.use_spatial_context=f
     if clip is not None:
         train = f" --policy.clip.model={clip['model']} --policy.clip.pretrained={clip['pretrained']}"
         train += " --policy.use_spatial_context=false" if scene else ""
-        evaluate = scene + size
+        evaluate = scene + seen
     return f"""    lerobot-train --policy.type=lansar{train} --policy.push_to_hub=false \\
         --dataset.repo_id={repo_id} --output_dir=outputs/train
     lerobot-eval --policy.path=outputs/train/checkpoints/last/pretrained_model --env.type=calvin \\

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import draccus
 import numpy as np
+from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from dataset_convert import card
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.layout import check_format
 from lerobot_lansar.clip.config import ClipConfig
-from lerobot_lansar.clip.store import IMAGE_FEATURES, EmbeddingWriter, clip_dir, dataset_fingerprint
+from lerobot_lansar.clip.store import IMAGE_FEATURES, PARTIAL, EmbeddingWriter, clip_dir, dataset_fingerprint
 from lerobot_lansar.command import run_command
 from lerobot_lansar.datasets import MANIFEST, find_dataset
 from lerobot_lansar.pictures import resize
@@ -31,6 +32,7 @@ ARRAYS = {feature: f"rgb_{camera}" for camera, feature in IMAGE_FEATURES.items()
 """The pictures that are embedded: LeRobot's feature to CALVIN's array."""
 
 _SAVE_EVERY = 20  # batches
+_PATIENCE = 3.0  # s to wait for another process, in case it is just ending
 
 
 @dataclass
@@ -171,8 +173,20 @@ def embed(
         num_workers: Processes that read pictures.
 
     Raises:
-        ValueError: There are embeddings of another CLIP, or of other frames.
+        ValueError: There are embeddings of another CLIP, or of other frames, or another process is embedding.
     """
+    lock = (root / PARTIAL).with_suffix(".lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(lock, timeout=_PATIENCE):
+            _embed(root, pictures, clip, options, batch_size, num_workers)
+    except Timeout:
+        raise ValueError(f"another process is embedding the pictures of {root}: wait for it or stop it") from None
+
+
+def _embed(
+    root: Path, pictures: Pictures, clip: "Clip", options: ClipConfig, batch_size: int, num_workers: int
+) -> None:
     from torch.utils.data import DataLoader, Subset  # late, as in load_clip
 
     writer = EmbeddingWriter(

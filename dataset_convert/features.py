@@ -19,11 +19,11 @@ from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, Datase
 from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from dataset_convert.frames import DEPTH, RGB, TACTILE, shape_of
+from dataset_convert.frames import TACTILE, shape_of
 from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder
 from dataset_convert.poses import pose_features
 from dataset_convert.stats import Stats
-from lerobot_lansar.calvin import ACTION_NAMES, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
+from lerobot_lansar.calvin import ACTION_NAMES, CAMERAS, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
 from lerobot_lansar.datasets import INTERVENTION_FEATURE
 
 _TASK_NAMES = [f"task_{task}" for task in TASKS]
@@ -33,7 +33,12 @@ _NUMBERS = ("calvin.frame", "calvin.window", "calvin.task", "calvin.scene")
 
 
 def pictures_of(
-    images: str, depth: bool, tactile: bool, encoder: RGBEncoder, image_size: int = 0
+    images: str,
+    depth: bool,
+    tactile: bool,
+    encoder: RGBEncoder,
+    image_size: int = 0,
+    cameras: Iterable[str] = tuple(CAMERAS),
 ) -> tuple[Picture, ...]:
     """All camera features that these options ask for.
 
@@ -43,6 +48,7 @@ def pictures_of(
         tactile: The fingertip sensors too. Their depth, fractions of a millimetre, is always stored exactly.
         encoder: Of the colour videos.
         image_size: Width and height of both cameras' pictures; 0: the cameras' own.
+        cameras: Those that were recorded.
 
     Raises:
         ValueError: LeRobot cannot encode like this here.
@@ -52,9 +58,9 @@ def pictures_of(
     rgb_codec, depth_codec = (_rgb_codec(encoder), _depth_codec()) if images == "video" else (None, None)
     if rgb_codec and image_size % 2 and "444" not in rgb_codec.pix_fmt:
         raise ValueError(f"--image_size={image_size}: videos as {rgb_codec.pix_fmt} need an even number")
-    found = [_camera_picture(array, image_size, rgb_codec) for array in RGB]
+    found = [_camera_picture(f"rgb_{camera}", image_size, rgb_codec) for camera in cameras]
     if depth:
-        found += [_camera_picture(array, image_size, depth_codec) for array in DEPTH]
+        found += [_camera_picture(f"depth_{camera}", image_size, depth_codec) for camera in cameras]
     if tactile:
         height, width, _ = TACTILE["rgb_tactile"]
         for finger in range(2):
@@ -131,7 +137,7 @@ def dataset_features(
         other: _vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
         **({INTERVENTION_FEATURE: {"dtype": "bool", "shape": (1,), "names": None}} if interventions else {}),
-        **{key: _matrix(numbers) for key, numbers in pose_features(bool(pictures), camera_poses).items()},
+        **{key: _matrix(numbers) for key, numbers in pose_features(_cameras(pictures), camera_poses).items()},
     }
     for picture in pictures:
         features[picture.key] = {
@@ -142,6 +148,12 @@ def dataset_features(
         if picture.is_depth:
             features[picture.key]["info"] = {"is_depth_map": True, "depth_unit": "m"}
     return {**features, **DEFAULT_FEATURES}
+
+
+def _cameras(pictures: Iterable[Picture]) -> list[str]:
+    """The cameras whose colours are among these features."""
+    keys = {picture.key for picture in pictures}
+    return [camera for camera in CAMERAS if f"observation.images.{camera}" in keys]
 
 
 def _vector(names: Iterable[str]) -> dict:

@@ -55,15 +55,15 @@ def frame_numbers(folder: Path) -> np.ndarray:
     return np.sort(np.array([number for number in numbers if number.isdecimal()], dtype=np.int64))
 
 
-def records_interventions(files: Iterable[Path]) -> bool:
-    """Whether a recording's frames say who acted, as the first readable one of these files does or does not."""
+def recorded_arrays(files: Iterable[Path]) -> set[str]:
+    """Names of the arrays in the first readable one of these frame files, which a split's frames have in common."""
     for file in files:
         try:
             with zipfile.ZipFile(file) as stored:
-                return f"{IS_INTERVENTION}.npy" in stored.NameToInfo
+                return {name.removesuffix(".npy") for name in stored.NameToInfo}
         except (OSError, zipfile.BadZipFile):  # reported when all frames are read
             continue
-    return False
+    return set()
 
 
 def shape_of(array: str, image_size: int = 0) -> tuple[int, ...]:

@@ -87,8 +87,6 @@ def read_windows(path: Path, scenes: dict[str, tuple[int, int]]) -> list[Window]
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         wanted = "language.ann, language.task and info.indx of one length"
         raise ValueError(f"{path}: expected {wanted} ({error})") from error
-    if not spans:
-        raise ValueError(f"{path}: holds no annotated window")
     return [
         Window(start, end, task, sentence.strip(), scene_of(start, end, scenes))
         for (start, end), task, sentence in zip(spans, tasks, sentences, strict=True)

@@ -109,6 +109,10 @@ class ConvertConfig:
             raise ValueError("--dedup needs --mode=windows: in play every frame occurs once")
         if self.images == "none" and (self.depth or self.tactile or self.camera_poses):
             raise ValueError("--images=none excludes --depth, --tactile and --camera_poses")
+        if self.clip != ClipConfig() and not self.embed:
+            raise ValueError("--clip.model and --clip.pretrained need --embed=true: nothing is embedded without it")
+        if self.rgb_encoder != RGBEncoder() and self.images != "video":
+            raise ValueError(f"--rgb_encoder needs --images=video, not {self.images}: nothing is encoded without it")
         check_size("--image_size", self.image_size)
         if self.images == "video" and 0 < self.image_size < 16:
             raise ValueError(f"--image_size={self.image_size}: videos need 16 pixels or more; --images=png takes any")

@@ -17,13 +17,13 @@ from dataset_convert.episodes import (
     window_of_frames,
     window_spans,
 )
-from dataset_convert.frames import RGB, records_interventions
+from dataset_convert.frames import INTERVENTION, RGB, recorded_arrays
 from dataset_convert.language import read_embeddings
 from dataset_convert.options import ConvertConfig
 from dataset_convert.poses import describe_cameras
 from dataset_convert.shards import Job, cut_into_shards, describe, staging_of
 from dataset_convert.shared import ValidationStates, find_shared
-from lerobot_lansar.calvin import SCENE_NAMES, TASKS
+from lerobot_lansar.calvin import CAMERAS, SCENE_NAMES, TASKS
 from lerobot_lansar.datasets import NO_COMMAND
 
 FRAMES_PER_SHARD = 8000
@@ -46,6 +46,8 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
         FileNotFoundError: Frames are missing and `skip_bad` is off, or pictures were not recorded.
         ValueError: The source contradicts what is known of its scenes, or nothing is left to convert.
     """
+    if config.mode == "windows" and not split.windows:
+        raise ValueError(f"{split.language} holds no annotated window: --mode=play needs none")
     if not split.scenes_from.startswith("scene_info"):
         warn(f"{split.folder}: scene {', '.join(split.scenes)} ({split.scenes_from})")
     if config.lang_embeddings:
@@ -61,15 +63,17 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
     from dataset_convert import features  # imports LeRobot, which takes seconds; worker processes import this module
 
     size = _image_size(config, split)
-    pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder, size)
-    recorded = records_interventions(split.frame_file(span.start) for span in spans)
+    recorded = recorded_arrays(split.frame_file(span.start) for span in spans)
+    cameras = [camera for camera in CAMERAS if f"rgb_{camera}" in recorded] or list(CAMERAS)
+    pictures = features.pictures_of(config.images, config.depth, config.tactile, config.rgb_encoder, size, cameras)
+    says_who_acted = INTERVENTION.keys() <= recorded
     info = features.empty_info(
         config.action,
         pictures,
         config.scene_state,
         config.task_in_state,
         config.camera_poses,
-        recorded or config.is_intervention,
+        says_who_acted or config.is_intervention,
     )
     job = Job(
         split=split,
@@ -86,7 +90,7 @@ def make_plan(config: ConvertConfig, split: CalvinSplit) -> tuple[Job, Any, dict
         scene_names=[*SCENE_NAMES, *sorted(set(scenes) - set(SCENE_NAMES))],
         skip_bad=config.skip_bad,
         camera_poses=config.camera_poses,
-        interventions="recorded" if recorded else "all" if config.is_intervention else "",
+        interventions="recorded" if says_who_acted else "all" if config.is_intervention else "",
         also_checked=tuple(RGB) if config.embed else (),
         validation=None if config.exclude_shared else validation,
     )
@@ -141,6 +145,11 @@ def _shared_frames(config: ConvertConfig, split: CalvinSplit) -> tuple[list[int]
     """Frames that are in training and in validation, of which it prints what happens to them; validation's states."""
     workers = config.workers if config.executor == "local" else 1
     validation = ValidationStates.read(split.root / "validation", workers) if config.split == "training" else None
+    if validation is None and config.exclude_shared:
+        raise FileNotFoundError(
+            f"--exclude_shared=true needs the frames of {split.root / 'validation'}, which is empty or missing: "
+            "download them, or leave out the option"
+        )
     if validation is None:
         return [], None
     shared = find_shared(split, validation, _planned_frames(config, split) if config.exclude_shared else None, workers)

@@ -3,6 +3,7 @@
 Conventions are those of `lerobot_lansar.cameras`, OpenCV's. Matrices in columns are written row by row.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,9 @@ def pose_columns(robot_obs: np.ndarray, sizes: dict[str, int], as_observations: 
     return {key: matrices.reshape(len(robot_obs), -1) for key, matrices in columns.items()}
 
 
-def pose_features(has_pictures: bool, as_observations: bool) -> dict[str, int]:
+def pose_features(cameras: Iterable[str], as_observations: bool) -> dict[str, int]:
     """The names of these columns, and how many numbers they have."""
-    sizes = {"static": 1, "gripper": 1} if has_pictures else {}
+    sizes = dict.fromkeys(cameras, 1)
     return {key: rows.shape[1] for key, rows in pose_columns(np.zeros((1, 15)), sizes, as_observations).items()}
 
 

@@ -109,7 +109,7 @@ def _within(ranges: dict[str, tuple[int, int]], recordings: np.ndarray) -> dict[
 
 
 def _numbers_agree(folder: Path, training: Path, recordings: np.ndarray) -> bool:
-    """Whether the split's frames are numbered together with training's.
+    """Whether the split's frames are numbered together with training's: some are in both, and all of those agree.
 
     On ABC->D they are not: training's numbers begin anew at 0 and name frames of other scenes than validation's.
     """
@@ -117,11 +117,13 @@ def _numbers_agree(folder: Path, training: Path, recordings: np.ndarray) -> bool
     places = np.linspace(0, lengths.sum() - 1, _SAMPLES).astype(int)
     rows = np.searchsorted(np.cumsum(lengths), places, side="right")
     frames = places - (np.cumsum(lengths) - lengths)[rows] + recordings[rows, 0]
+    compared = False
     for frame in np.unique(frames).tolist():
         try:
             mine, theirs = (read_frame(frame_file(of, frame), STATES) for of in (folder, training))
         except (FileNotFoundError, ValueError):
             continue  # not in both; a defective frame is reported when it is converted
+        compared = True
         if not all(np.array_equal(mine[key], theirs[key]) for key in STATES):
             return False
-    return True
+    return compared

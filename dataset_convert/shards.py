@@ -133,7 +133,13 @@ class BadEpisode(Exception):
 
 
 def staging_of(output_dir: Path) -> Path:
-    """Where a dataset is prepared: a hidden folder beside its place, on the same file system."""
+    """Where a dataset is prepared: a hidden folder beside its place, on the same file system.
+
+    Raises:
+        ValueError: Its place is a file system of its own, into which no folder can be moved.
+    """
+    if output_dir.is_mount():
+        raise ValueError(f"--output_dir={output_dir} is a mount point: give a folder in it")
     return output_dir.parent / f".{output_dir.name}.incomplete"
 
 

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from dataset_convert import blocks
 from dataset_convert.calvin import CalvinSplit
 from dataset_convert.episodes import Span, as_ranges, play_spans, window_of_frames, window_spans
-from dataset_convert.frames import DEPTH, RGB, TACTILE, records_interventions, shape_of
+from dataset_convert.frames import DEPTH, INTERVENTION, RGB, TACTILE, recorded_arrays, shape_of
 from dataset_convert.language import EMBEDDINGS, LANG_FOLDER, embeddings_name, read_embeddings
 from dataset_convert.layout import check_format
 from dataset_convert.verify_shared import ValidationFrames
@@ -72,7 +72,8 @@ class Dataset:
             if found := blocks.contradictions(scene, evidence):
                 self.contradictions[scene] = found
             self.orders[scene] = blocks.block_order(scene, evidence, request.get("block_order", "checked"))
-        self.says_who_acted = records_interventions(self.split.frame_file(span.start) for span in self.spans)
+        recorded = recorded_arrays(self.split.frame_file(span.start) for span in self.spans)
+        self.says_who_acted = INTERVENTION.keys() <= recorded
         found_in = ValidationFrames(root) if request["split"] == "training" else None
         self.validation = found_in if found_in else None
 

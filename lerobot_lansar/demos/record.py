@@ -136,7 +136,7 @@ def _record_takeovers(config: RecordConfig, indices: list[int]) -> None:
     units = []
     for index in indices:
         slot = config.slot(index)
-        frames = config.session_frames(slot.split)[slot.number]
+        _, frames = config.sessions(slot.split)[slot.number]
         seed = [config.seed, SPLITS.index(slot.split), slot.number]
         units.append((index, slot.split, slot.scene, frames, seed, config.output_dir / STAGING / f"{index:06d}"))
     sentences = {split: load_commands(config.annotations_of(split), split) for split in SPLITS}
@@ -151,11 +151,11 @@ def record_unit(config: RecordConfig, index: int) -> None:
     desk = _desk(slot.scene, config.assets, tuple(config.cameras), config.renderer, config.depth)
     with FrameWriter(config.output_dir / STAGING / f"{index:06d}", desk.scene, config.image_size) as writer:
         if config.mode != "windows":
-            frames = config.session_frames(slot.split)[slot.number]
+            _, frames = config.sessions(slot.split)[slot.number]
             rng, whole = np.random.default_rng(seed), config.mode == "chains"
             unit = record_play(desk, frames, rng, writer, config.noise, config.variety, whole, config.weights)
         else:
-            task = config.tasks[slot.in_scene % len(config.tasks)]
+            task = config.tasks[slot.number % len(config.tasks)]
             demonstration, tried = _attempt(config, desk, task, seed)
             n = len(demonstration)
             for t in range(n):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..calvin import CONTROL_HZ, CONTROL_MODES
 from ..desk import SCENES, DeskError
@@ -36,13 +36,11 @@ class UnitSlot(NamedTuple):
         split: One of `SPLITS`.
         number: The unit's number within its split.
         scene: Letter of the scene that it is recorded in.
-        in_scene: The unit's number among those of its scene and split.
     """
 
     split: str
     number: int
     scene: str
-    in_scene: int
 
 
 @dataclass
@@ -139,11 +137,17 @@ class RecordConfig:
     slurm: SlurmConfig = field(default_factory=SlurmConfig)
 
     def __post_init__(self) -> None:
-        if self.validation_episodes is None:
-            one_of_each = len(self.tasks) * len(self.scenes)
-            self.validation_episodes = max(one_of_each, round(self.episodes / 10))
-        if self.validation_hours is None:
-            self.validation_hours = max(self.hours / 10, _SHORTEST)
+        for name in ("validation_episodes", "validation_hours"):
+            if getattr(self, name) is None:
+                setattr(self, name, self._usual(name))
+
+    def _usual(self, name: str) -> Any:
+        """The default of an option of `_SESSION_OPTIONS` or `_EPISODE_OPTIONS`, which may depend on others."""
+        if name == "validation_episodes":
+            return max(len(self.tasks) * len(self.scenes), round(self.episodes / 10))
+        if name == "validation_hours":
+            return max(self.hours / 10, _SHORTEST)
+        return getattr(RecordConfig, name)
 
     def check(self) -> None:
         """Raises ValueError for options that cannot be carried out."""
@@ -176,8 +180,8 @@ class RecordConfig:
             if not _SHORTEST * 60 <= getattr(self, name) * minutes <= 1e6:
                 raise DeskError(f"--{name} must be at least 6 seconds, got {getattr(self, name)}")
         self._check_takeovers()
-        for name in ("hours", "session_minutes") if self.mode == "windows" else ("episodes",):
-            if getattr(self, name) != self.__dataclass_fields__[name].default:
+        for name in _SESSION_OPTIONS if self.mode == "windows" else _EPISODE_OPTIONS:
+            if getattr(self, name) != self._usual(name):
                 raise DeskError(f"--{name} has no effect with --mode={self.mode}: leave it out, or choose another mode")
         for group, weight in self.weights.items():
             if group not in GROUPS:
@@ -233,15 +237,21 @@ class RecordConfig:
         if self.mode == "windows":
             assert self.validation_episodes is not None
             return self.episodes, self.validation_episodes
-        training, validation = (len(self.session_frames(split)) for split in SPLITS)
+        training, validation = (len(self.sessions(split)) for split in SPLITS)
         return training, validation
 
-    def session_frames(self, split: str) -> list[int]:
-        """Frames in each session of play; the last session holds the remainder."""
+    def sessions(self, split: str) -> list[tuple[str, int]]:
+        """Scene and frames of each session of play: equally many frames in each scene, whose last session holds the
+        remainder."""
         hours = self.hours if split == "training" else self.validation_hours
         assert hours is not None
-        left, each = (round(minutes * 60 * CONTROL_HZ) for minutes in (hours * 60, self.session_minutes))
-        return [min(each, left - start) for start in range(0, left, each)]
+        total, each = (round(minutes * 60 * CONTROL_HZ) for minutes in (hours * 60, self.session_minutes))
+        shares = [total * (k + 1) // len(self.scenes) - total * k // len(self.scenes) for k in range(len(self.scenes))]
+        return [
+            (scene, min(each, share - start))
+            for scene, share in zip(self.scenes, shares, strict=True)
+            for start in range(0, share, each)
+        ]
 
     def shard_size(self) -> int:
         """Units that one shard of work records; decided by the request alone."""
@@ -254,13 +264,17 @@ class RecordConfig:
         return self.annotations if split == "training" else self.validation_annotations
 
     def slot(self, index: int) -> UnitSlot:
-        """Where the `index`-th of all units belongs. Units are grouped by scene; tasks cycle within each scene."""
+        """Where the `index`-th of all units belongs. Units are grouped by scene."""
         training, validation = self.counts()
         split, count = ("training", training) if index < training else ("validation", validation)
         number = index if index < training else index - training
-        scenes = group_by_scene(self.scenes, count)
-        return UnitSlot(split, number, scenes[number], number - scenes.index(scenes[number]))
+        if self.mode == "windows":
+            return UnitSlot(split, number, group_by_scene(self.scenes, count)[number])
+        return UnitSlot(split, number, self.sessions(split)[number][0])
 
+
+_SESSION_OPTIONS = ("hours", "validation_hours", "session_minutes")
+_EPISODE_OPTIONS = ("episodes", "validation_episodes")
 
 _TAKEOVER_OPTIONS = {
     "policy": TakeoverPolicy(),

@@ -20,6 +20,7 @@ from ..command import run_command
 from ..desk import Desk, DeskError, Observation
 from ..desk.sentences import load_commands
 from ..desk.starts import sample_start
+from ..jobs.staging import staging
 from .calvin_folder import FrameWriter, Unit, publish_split
 from .video import Video
 
@@ -51,6 +52,7 @@ SIZE = 600
 """Width and height of the large picture, in pixels."""
 STAGING = ".playing"
 """The folder in OUTPUT_DIR in which kept demonstrations wait."""
+_NOTE = ".unit"  # extension of the files that describe them
 DEMONSTRATION = "a8 w6 f7 wait4 r4 space wait10"
 """Keys pressed if there is neither a display nor `--keys`: the hand presses the LED's button and closes."""
 
@@ -163,7 +165,18 @@ class Session:
                 writer.add(row)
         n = len(self._rows)
         unit = Unit(self.desk.scene.name, n, [(0, n)], [(0, n, task)], sums=writer.sums())
-        self.kept.append((folder, unit, [self._commands[task][0]]))
+        unit.sentences = [self._commands[task][0]]
+        unit.save(folder.with_suffix(_NOTE))
+        self.kept.append((folder, unit, unit.sentences))
+
+    def take_up(self) -> None:
+        """Takes up what a session of the same options kept that was killed."""
+        assert self.config.output_dir is not None
+        for note in sorted((self.config.output_dir / STAGING).glob(f"*{_NOTE}")):
+            unit = Unit.load(note)
+            self.kept.append((note.with_suffix(""), unit, unit.sentences))
+        if self.kept:
+            print(f"{len(self.kept)} demonstrations of a session that was killed are kept, too", file=sys.stderr)
 
     def finish(self) -> None:
         """Publishes the kept demonstrations as OUTPUT_DIR/training; to be called however the session ended."""
@@ -274,11 +287,21 @@ def open_window() -> Any | None:
     return pygame
 
 
+def _keeping(config: TeleopConfig) -> AbstractContextManager[None]:
+    """Makes the place where kept demonstrations wait, for one session at a time."""
+    if config.output_dir is None:
+        return nullcontext()
+    request = {"scene": config.scene, "assets": config.assets, "renderer": config.renderer}
+    folder, target = config.output_dir / STAGING, config.output_dir / "training"
+    return staging(folder, target, request, lambda place: any(place.glob(f"*{_NOTE}")))
+
+
 def teleoperate(config: TeleopConfig) -> Session:
     """Runs a session to its end and returns it.
 
     Raises:
         DeskError: An option cannot be carried out.
+        ValueError: Another session is keeping demonstrations there, or one with other options did and was killed.
     """
     config.check()
     pygame = open_window() if config.keys is None else None
@@ -288,18 +311,19 @@ def teleoperate(config: TeleopConfig) -> Session:
     cameras = () if config.output_dir is None else tuple(CAMERAS)  # pictures are recorded, or else only shown
     with Desk(config.scene, config.assets, cameras, config.renderer) as desk:
         session = Session(config, desk)
-        if config.output_dir is not None:  # left by a session that was killed
-            shutil.rmtree(config.output_dir / STAGING, ignore_errors=True)
         recorder: AbstractContextManager[Video | None] = Video(path) if path else nullcontext()
-        try:
-            with recorder as video:
-                if pygame is None:
-                    press_keys(session, config.keys or DEMONSTRATION, video)
-                else:
-                    drive_in_window(session, pygame, video)
-                    pygame.quit()
-        finally:
-            session.finish()
+        with _keeping(config):
+            if config.output_dir is not None:
+                session.take_up()
+            try:
+                with recorder as video:
+                    if pygame is None:
+                        press_keys(session, config.keys or DEMONSTRATION, video)
+                    else:
+                        drive_in_window(session, pygame, video)
+                        pygame.quit()
+            finally:
+                session.finish()
         print(f"fulfilled: {', '.join(session.fulfilled) or 'nothing'}")
     return session
 

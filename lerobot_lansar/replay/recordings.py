@@ -191,6 +191,8 @@ class FolderSource:
     def __init__(self, root: Path, split: str, scene: str = ""):
         scene = "" if (root / split / SCENE_FILE).is_file() else scene
         self._split = CalvinSplit(root, split, scene=scene, skip_bad=True)
+        if not self._split.windows:
+            raise CommandError(f"{self._split.language} holds no annotated window to replay")
         self._order = cache(self._block_order)
 
     def __len__(self) -> int:

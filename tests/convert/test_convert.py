@@ -389,6 +389,8 @@ def test_the_command_converts_and_says_where(calvin, tmp_path, monkeypatch, caps
         (["--images=none", "--mode=both"], "--mode=both: expected windows or play"),
         (["--images=none", "--mode=play", "--dedup=task"], "--dedup needs --mode=windows"),
         (["--images=none", "--depth=true"], "--images=none"),
+        (["--images=none", "--clip.model=lansar-desk"], "--clip.pretrained need --embed=true"),
+        (["--images=png", "--rgb_encoder.crf=20"], "--rgb_encoder needs --images=video"),
         (["--images=none", "--private=true"], "--private=true needs --push_to_hub=true"),
         (["--images=none", "--executor=cloud"], "--executor is one of"),
         (["--images=none", "--split=training", "--exclude_shared=perhaps"], "exclude_shared"),

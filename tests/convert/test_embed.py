@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_calvin import write_calvin
+from filelock import FileLock
 from huggingface_hub.utils import DEFAULT_IGNORE_PATTERNS, filter_repo_objects
 
 from dataset_convert import embed
@@ -16,7 +17,7 @@ from dataset_convert.options import ConvertConfig
 from dataset_convert.verify import Mismatch, VerifyConfig, verify
 from lerobot_lansar.clip import store
 from lerobot_lansar.clip.config import ClipConfig
-from lerobot_lansar.clip.store import sha256
+from lerobot_lansar.clip.store import PARTIAL, sha256
 
 clip_module = pytest.importorskip("lerobot_lansar.clip.model")
 
@@ -171,6 +172,16 @@ def test_embeddings_of_something_else_are_not_overwritten(made, run, tmp_path, c
     assert code == 2
     assert message in printed.err
     assert "delete that folder" in printed.err
+
+
+def test_only_one_pass_at_a_time(made, run, tmp_path, monkeypatch):
+    copy = without_clip(made, "png", tmp_path)
+    monkeypatch.setattr(embed, "_PATIENCE", 0.1)
+    with FileLock((copy / PARTIAL).with_suffix(".lock")):
+        code, printed = run(copy)
+    assert code == 2
+    assert f"another process is embedding the pictures of {copy}" in printed.err
+    assert run(copy)[0] == 0
 
 
 def test_the_same_again_does_nothing(made, run):

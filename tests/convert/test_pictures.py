@@ -85,9 +85,10 @@ def test_a_recording_of_another_size_keeps_it_and_is_not_resized_again(painted, 
     with pytest.raises(ValueError, match=r"'rgb_static' is uint8 \(64, 64, 3\), expected uint8 \(200, 200, 3\)"):
         convert(options(painted, tmp_path / "out"))
     say(painted.folder, renderer="tiny", assets_used="built-in", image_size=64)
-    out = convert(options(painted, tmp_path / "out", depth=True, images="video"))
+    out = convert(options(painted, tmp_path / "out", depth=True, images="video", task_in_state=True))
     assert manifest_of(out)["look"] == {"renderer": "tiny", "assets": "built-in", "image_size": 64}
     assert load(out).meta.features["observation.images.gripper"]["shape"] == (64, 64, 3)
+    assert "--env.image_size=64" in (out / "README.md").read_text()
     with pytest.raises(ValueError, match=r"--image_size=96: .* was recorded with --image_size=64"):
         convert(options(painted, tmp_path / "again", image_size=96))
 
@@ -197,6 +198,21 @@ def test_camera_poses_as_observations_have_the_environments_names(painted, tmp_p
     for key in (name for name in seen if name.startswith("camera_")):
         np.testing.assert_array_equal(item[f"observation.{key}"], seen[key])
     assert "pixel by pixel" in verify(VerifyConfig("me/desk", painted.root, out))
+
+
+def test_one_camera_is_enough(painted, tmp_path):
+    for frame, content in painted.frames.items():
+        del content["rgb_gripper"], content["depth_gripper"]
+        painted.rewrite(frame)
+    out = convert(options(painted, tmp_path / "out", depth=True, camera_poses=True))
+    features = load(out).meta.features
+    pictures = {"observation.images.static", "observation.images.static_depth"}
+    assert {key for key in features if key.startswith("observation.images.")} == pictures
+    assert [key for key in features if key.startswith("observation.camera_pose.")] == ["observation.camera_pose.static"]
+    assert set(manifest_of(out)["cameras"]) == {"convention", "static"}
+    assert "pixel by pixel" in verify(VerifyConfig("me/desk", painted.root, out))
+    with pytest.raises(ValueError, match="'rgb_gripper' is missing"):
+        convert(options(painted, tmp_path / "embedded", embed=True))
 
 
 def test_without_pictures_there_are_no_cameras(calvin, tmp_path):

@@ -72,6 +72,9 @@ def test_trainings_scenes_are_believed_only_where_their_numbers_are_validations(
     if copied:
         shutil.copy(training.folder / "scene_info.npy", validation.folder)
     assert CalvinSplit(validation.root, "validation").scenes == {"C": (5, 52)}
+    for file in training.folder.glob("episode_*.npz"):  # not downloaded: nothing speaks for training's scenes
+        file.unlink()
+    assert CalvinSplit(validation.root, "validation").scenes == {"D": (5, 52)}
 
 
 def test_a_scene_is_asked_for_where_nothing_can_tell_it(tmp_path):
@@ -87,6 +90,12 @@ def test_a_scene_is_asked_for_where_nothing_can_tell_it(tmp_path):
 
 
 # ---- frames in both splits
+
+
+def test_shared_frames_are_left_out_only_if_validation_is_there(tmp_path):
+    calvin = write_calvin(tmp_path / "calvin")
+    with pytest.raises(FileNotFoundError, match="--exclude_shared=true needs the frames of"):
+        convert(options(calvin, tmp_path / "out", exclude_shared=True))
 
 
 def test_equal_numbers_are_not_equal_frames(tmp_path, capsys):

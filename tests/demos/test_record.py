@@ -6,13 +6,14 @@ import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 import lerobot_lansar.demos.record as record_module
-from lerobot_lansar.calvin import CAMERAS, DRAWER, relative_action
+from lerobot_lansar.calvin import CAMERAS, CONTROL_HZ, DRAWER, relative_action
 from lerobot_lansar.demos.record import RecordConfig, record
 from lerobot_lansar.demos.record_config import SPLITS, group_by_scene
 from lerobot_lansar.demos.skills import SKILLS
@@ -110,7 +111,7 @@ def test_every_scene_gets_every_task(tmp_path):
     assert config.validation_episodes == 6
     training, validation = config.counts()
     slots = [config.slot(index) for index in range(training + validation)]
-    found = {split: [(s.scene, s.in_scene % 2) for s in slots if s.split == split] for split in SPLITS}
+    found = {split: [(s.scene, s.number % 2) for s in slots if s.split == split] for split in SPLITS}
     assert {pair: found["training"].count(pair) for pair in found["training"]} == {
         (scene, task): 2 for scene in "ABC" for task in (0, 1)
     }
@@ -362,6 +363,15 @@ def test_users_sentences_are_used(tmp_path):
 def test_units_are_divided_evenly_among_scenes_and_grouped_by_scene():
     assert group_by_scene(["A", "B", "C"], 7) == ["A", "A", "A", "B", "B", "C", "C"]
     assert group_by_scene(["A", "B", "C"], 1) == ["A"]
+    for hours in (0.1, 1.0, 4.0):
+        config = RecordConfig(Path("desk"), scene=["A", "B", "C", "D"], mode="chains", hours=hours)
+        for split in SPLITS:
+            frames = {scene: sum(n for s, n in config.sessions(split) if s == scene) for scene in "ABCD"}
+            assert max(frames.values()) - min(frames.values()) <= 1
+            assert max(n for _, n in config.sessions(split)) <= 2 * 60 * CONTROL_HZ
+    config = RecordConfig(Path("desk"), scene=["A", "B", "C", "D"])
+    told = [config.tasks[config.slot(index).number % len(config.tasks)] for index in range(config.episodes)]
+    assert set(told) == set(config.tasks), "25 episodes of each scene do not leave out the same nine tasks"
 
 
 def test_frames_of_a_recording_are_grouped_by_scene(tmp_path):
@@ -401,7 +411,9 @@ CHAINS = {"mode": "chains", "tasks": list(SKILLS)}
         ({"scene": "D_eval"}, "--scene: 'D_eval' is none of A, B, C, D"),
         ({"mode": "play"}, "--tasks goes with --mode=windows"),
         ({"hours": 5.0}, "--hours has no effect with --mode=windows"),
+        ({"validation_hours": 5.0}, "--validation_hours has no effect with --mode=windows"),
         ({"episodes": 3, **CHAINS}, "--episodes has no effect with --mode=chains"),
+        ({"validation_episodes": 5, **CHAINS}, "--validation_episodes has no effect with --mode=chains"),
         (
             {"weights": {"lift": 2.0}, **CHAINS},
             "--weights: there is no group 'lift' of tasks; choose among",

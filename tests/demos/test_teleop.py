@@ -1,5 +1,7 @@
 """`lansar-play`, by keys and through a window that nobody sees."""
 
+from dataclasses import replace
+
 import av
 import numpy as np
 import pytest
@@ -82,6 +84,21 @@ def test_what_was_kept_survives_a_session_that_fails(tmp_path, monkeypatch):
         )
     assert len(CalvinSplit(tmp_path / "mine", "training").windows) == 1
     assert not (tmp_path / "v.mp4").exists()
+
+
+def test_what_was_kept_survives_a_session_that_is_killed(tmp_path, monkeypatch, capsys):
+    config = teleop.TeleopConfig(
+        keys="enter a8 w6 f7 wait4 r4 enter", output_dir=tmp_path / "mine", video=tmp_path / "v.mp4"
+    )
+    with monkeypatch.context() as killed:
+        killed.setattr(teleop.Session, "finish", lambda session: None)
+        teleop.teleoperate(config)
+    assert not (tmp_path / "mine" / "training").exists()
+    with pytest.raises(ValueError, match="begun with other options"):
+        teleop.teleoperate(replace(config, scene="A"))
+    teleop.teleoperate(config)
+    assert "1 demonstrations of a session that was killed are kept, too" in capsys.readouterr().err
+    assert len(CalvinSplit(tmp_path / "mine", "training").windows) == 2
 
 
 def test_the_window_takes_keys(monkeypatch, tmp_path):
