@@ -64,6 +64,21 @@ class StepError(Exception):
     """A step failed or took too long."""
 
 
+running: set[subprocess.Popen] = set()
+"""The commands of `run` in all threads."""
+
+
+def end(process: subprocess.Popen) -> None:
+    """Ends a command with its workers."""
+    try:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(5)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+
+
 def run(title: str, log: Path, seconds: float, *command: object) -> None:
     """Runs a command from the repository's root; its output goes to `log`.
 
@@ -82,17 +97,16 @@ def run(title: str, log: Path, seconds: float, *command: object) -> None:
         process = subprocess.Popen(
             [program, *words[1:]], cwd=ROOT, env=environment, stdout=file, stderr=file, start_new_session=True
         )
+        running.add(process)
         try:
             code = process.wait(max(1, seconds))
         except BaseException as error:
-            os.killpg(process.pid, signal.SIGTERM)  # with its workers
-            try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
+            end(process)
             if not isinstance(error, subprocess.TimeoutExpired):
                 raise
             raise StepError(f"{title} was ended after {seconds:.0f} s") from None
+        finally:
+            running.discard(process)
     if code:
         raise StepError(f"{title} ended with exit code {code}: see {log}")
     print(f"--- {title}: {time.time() - started:.0f} s", flush=True)
@@ -286,6 +300,10 @@ class Thesis:
                 self.record()
             except StepError as error:
                 self.problems.append(str(error))
+            except BaseException:  # Ctrl-C, or a batch system's signal: it must not wait for the measurement
+                for process in list(running):
+                    end(process)
+                raise
             measuring.result()
         if (self.dataset / "meta/info.json").exists():
             evaluating = SHARES["evaluate"] * self.seconds / len(ROWS)

@@ -94,6 +94,7 @@ class Options:
     batch_size: int = 96
     learning_rate: float = 1e-3
     seed: int = 0
+    # Where `train` and `judge` compute.
     device: str = "cpu"
     # A weights file whose text encoder is kept. None: both encoders are trained.
     text: Path | None = None
@@ -334,8 +335,10 @@ class Data:
         files = [f for f in sorted(options.root.glob("session_*.npz")) if "partial" not in f.name]
         files = [file for file in files if (int(file.stem[-4:]) // ROUND % 10 == 0) == held_out]
         if not files:
+            which = f"no session of a round that is {'held out' if held_out else 'learned'}"
             raise SystemExit(
-                f"there are no sessions in {options.root}: run `python scripts/train_clip.py record` first"
+                f"{options.root} holds {which}: run `python scripts/train_clip.py record` with more than {ROUND} "
+                "--sessions first"
             )
         parts = [dict(np.load(file)) for file in tqdm(files, desc="reading", unit="session")]
         keys = ("static", "gripper", "robot_obs", "scene_obs", "places")
@@ -430,7 +433,8 @@ def train(options: Options) -> None:
             parameter.requires_grad_(name not in kept)
     heads = nn.ModuleDict({camera: nn.Linear(clip.embed_dim, 16) for camera in UNITS}).to(options.device)
     weights = [w for w in (*model.parameters(), *heads.parameters()) if w.requires_grad]
-    optimizer = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.05, betas=(0.9, 0.98))
+    optimizer = torch.optim.AdamW(weights, lr=options.learning_rate, weight_decay=0.05, betas=(0.95, 0.98))
+    # It also moves the first beta, between 0.95 and 0.85.
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, options.learning_rate, options.steps, pct_start=0.05)
     contrast = ClipLoss()
     encoder, scores = model.visual.trunk, {}
@@ -489,7 +493,7 @@ CENTRES = {
 
 def judge(options: Options) -> None:
     """Prints how many held-out sentences are nearest to their own task, and what linear probes read from pictures."""
-    clip = Clip(ClipConfig(MODEL, str(options.output)))
+    clip = Clip(ClipConfig(MODEL, str(options.output)), options.device)
     _judge_sentences(clip, options)
     _judge_pictures(clip, options)
 
@@ -506,7 +510,7 @@ def _judge_sentences(clip: Clip, options: Options) -> None:
     missed = []
     for name, sentences in sets.items():
         pairs = [(task, sentence) for task in tasks for sentence in sentences[task]]
-        found = (embed([sentence for _, sentence in pairs]) @ centres.T).argmax(1)
+        found = (embed([sentence for _, sentence in pairs]) @ centres.T).argmax(1).tolist()
         right = [tasks[k] == task for k, (task, _) in zip(found, pairs, strict=True)]
         missed += [(s, t, tasks[k]) for k, (t, s), ok in zip(found, pairs, right, strict=True) if not ok]
         print(f"| {name} | {sum(right)} of {len(right)} ({100 * np.mean(right):.1f} %) |")
@@ -538,7 +542,7 @@ def _judge_pictures(clip: Clip, options: Options) -> None:
 
 def _embedded(clip: Clip, data: Data, camera: str, rows: np.ndarray) -> np.ndarray:
     parts = np.array_split(rows, max(1, len(rows) // 256))
-    return np.concatenate([clip.encode_images(data.arrays[camera][part]).numpy() for part in parts])
+    return np.concatenate([clip.encode_images(data.arrays[camera][part]).cpu().numpy() for part in parts])
 
 
 def _probe(x: np.ndarray, truth: np.ndarray, y: np.ndarray) -> np.ndarray:

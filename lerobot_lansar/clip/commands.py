@@ -25,7 +25,8 @@ class CommandStep(ProcessorStep):
 
     Attributes:
         model, pretrained: See `ClipConfig`.
-        weights_sha256: Hash of the CLIP that the policy was trained with; "" before training.
+        weights_sha256: Hash of the CLIP that the policy was trained with, of its text encoder alone if the policy reads
+            no embeddings of pictures; "" before training.
     """
 
     model: str
@@ -44,17 +45,21 @@ class CommandStep(ProcessorStep):
         if self._clip is None:
             clip = Clip(ClipConfig(self.model, self.pretrained), device or "cpu", self._weights)
             for what, expected in self._made_with().items():
-                if expected and expected != clip.weights_sha256:
+                if expected and expected not in (clip.weights_sha256, self._identity(clip)):
                     raise ValueError(
                         f"The {what} with other weights of CLIP {self.model} (sha256 {expected[:12]}...) "
-                        f"than pretrained={self.pretrained!r} has now (sha256 {clip.weights_sha256[:12]}...). "
+                        f"than pretrained={self.pretrained!r} has now (sha256 {self._identity(clip)[:12]}...). "
                         "Convert the dataset again, or train a new policy with --policy.clip.pretrained as it was then."
                     )
-            self._clip, self.weights_sha256, self._weights = clip, clip.weights_sha256, None
+            self._clip, self.weights_sha256, self._weights = clip, self._identity(clip), None
         if device is not None and self._clip.device != torch.device(device):
             self._clip.to(device)
             self._commands.clear()
         return self._clip
+
+    def _identity(self, clip: Clip) -> str:
+        """The hash of what the policy reads embeddings of."""
+        return clip.text_sha256
 
     def _made_with(self) -> dict[str, str]:
         """What must have been made with the same weights, as the error says it, and their hash."""
@@ -76,7 +81,7 @@ class CommandStep(ProcessorStep):
         return new
 
     def get_config(self) -> dict[str, Any]:
-        sha256 = self.clip().weights_sha256
+        sha256 = self._identity(self.clip())
         return {"model": self.model, "pretrained": self.pretrained, "weights_sha256": sha256}
 
     def state_dict(self) -> dict[str, Tensor]:

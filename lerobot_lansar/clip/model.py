@@ -77,6 +77,14 @@ def weights_are_public(config: ClipConfig) -> bool:
     return bool(config.pretrained and known)
 
 
+def _sha256(weights: dict[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name, value in sorted(weights.items()):
+        digest.update(name.encode())
+        digest.update(value.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
 class ImageEncoder(nn.Module):
     """The image half of a CLIP.
 
@@ -212,11 +220,13 @@ class Clip:
     @functools.cached_property
     def weights_sha256(self) -> str:
         """SHA-256 over names and values of all weights: identifies the CLIP that made an embedding."""
-        digest = hashlib.sha256()
-        for name, value in sorted(self.model.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(value.cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return _sha256(self.model.state_dict())
+
+    @functools.cached_property
+    def text_sha256(self) -> str:
+        """The same of the text encoder alone: identifies the CLIP that made a sentence's embedding."""
+        weights = self.model.state_dict()
+        return _sha256({n: v for n, v in weights.items() if not n.startswith(("visual.", "logit_"))})
 
     def to(self, device: str | torch.device) -> None:
         """Moves everything to another device."""

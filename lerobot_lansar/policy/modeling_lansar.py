@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from huggingface_hub import ModelCard
 from lerobot.configs import parser
-from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
@@ -20,6 +19,7 @@ from ..calvin import ANGLE_UNIT, CONTROL_MODES, GRIPPER_ACTION, POSITION_UNIT, T
 from ..clip.commands import CLIP_COMMAND
 from ..clip.model import Clip, ImageEncoder
 from ..clip.store import IMAGE_FEATURES
+from ..trained_options import check_trained_options
 from .card import card_text
 from .configuration_lansar import LanSARConfig
 from .losses import Losses
@@ -106,7 +106,7 @@ class LanSARPolicy(PreTrainedPolicy):
         self.scaler = Scaler(config.orientation, config.egocentric_blocks, config.since_command)
         self.network = LanSARNetwork(config.network)
         if dataset_meta is not None:
-            self._check_pretrained()
+            check_trained_options(config, TRAINED_OPTIONS)
         self.image_encoder: ImageEncoder | None = None
         if config.finetune_clip:
             # Only a new training starts from CLIP's weights; a checkpoint has its own.
@@ -134,28 +134,6 @@ class LanSARPolicy(PreTrainedPolicy):
                 self._losses.load(Path(str(config.pretrained_path)))
         self.reset()
 
-    def _check_pretrained(self) -> None:
-        """Rejects options that pretrained weights were not trained with.
-
-        Some would change silently what the weights mean; others would fail later, with a message about shapes.
-
-        Raises:
-            ValueError: An option of `TRAINED_OPTIONS` is not that of the checkpoint.
-        """
-        if not self.config.pretrained_path:
-            return
-        trained = PreTrainedConfig.from_pretrained(
-            self.config.pretrained_path, revision=self.config.pretrained_revision
-        )
-        assert isinstance(trained, LanSARConfig)
-        for name in TRAINED_OPTIONS:
-            given, expected = getattr(self.config, name), getattr(trained, name)
-            if given != expected:
-                raise ValueError(
-                    f"--policy.{name}={given}: {self.config.pretrained_path} was trained with {name}={expected}, on "
-                    "which its weights and scaling depend. Omit the option, or train a new policy."
-                )
-
     def get_optim_params(self) -> Any:
         parameters = list(self.network.parameters())
         groups: list[dict[str, Any]] = [{"params": parameters}]
@@ -167,6 +145,15 @@ class LanSARPolicy(PreTrainedPolicy):
         if self.config.optimizer == "adamw" and parameters[0].is_cuda:
             groups = [group | {"fused": True} for group in groups]  # one kernel that reads and writes everything once
         return groups if len(groups) > 1 or parameters[0].is_cuda else parameters
+
+    def train(self, mode: bool = True) -> "LanSARPolicy":
+        """As usual; but under LoRA's adapters, which alone are saved, BatchNorm keeps the checkpoint's statistics."""
+        super().train(mode)
+        if self.config.use_peft:
+            for module in self.modules():
+                if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
+                    module.eval()
+        return self
 
     def reset(self) -> None:
         """Clears all histories; LeRobot calls this before each batch of episodes."""

@@ -44,6 +44,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from ..clip.commands import CommandStep, Features
+from ..clip.model import Clip
 from ..clip.store import IMAGE_FEATURES
 from .configuration_lansar import LanSARConfig
 from .windows import Windows, get_current
@@ -132,6 +133,9 @@ class ClipStep(CommandStep):
 
     use_images: bool = True
     _windows: Windows | None = field(default_factory=get_current, init=False, repr=False)
+
+    def _identity(self, clip: Clip) -> str:
+        return clip.weights_sha256 if self.use_images else clip.text_sha256
 
     def _made_with(self) -> dict[str, str]:
         info = self._windows.clip_info if self._windows is not None else {}

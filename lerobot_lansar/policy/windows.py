@@ -203,9 +203,9 @@ class Windows:
         first, end = self._first[row], self._end[row]  # a last frame without target belongs to no window
         place = row - self.frames["first"][row]
         row = first + place * (end - first) // self._lengths[row]  # the same row, unless its episode was cropped
-        spare = np.maximum(end - first - self.length, 0)
-        spread = first + (row - first) * (spare + 1) // np.maximum(end - first, 1)
         anywhere = np.minimum(row, end - 1)
+        spare = np.maximum(end - first - self.length, 0)
+        spread = first + (anywhere - first) * (spare + 1) // (end - first)
         mixed = np.where(index % 2 == 0, spread, anywhere)
         start = {"episode": spread, "anywhere": anywhere, "mixed": mixed}[self.rule]
         return start, np.minimum(start + self.length, end)

@@ -8,6 +8,7 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
 from torch.utils.data import default_collate
 
+from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.datasets import NO_COMMAND
 from lerobot_lansar.peers.gr1.modeling_gr1 import load_image_encoder
 from lerobot_lansar.peers.gr1.network import Seen
@@ -275,6 +276,38 @@ def test_gr1_learns_nothing_from_beyond_a_demonstration(datasets):
     assert before == pytest.approx(after, rel=1e-5)
     batch["action"][:, 3] = 5
     assert policy.forward(batch)[1]["arm_loss"] != pytest.approx(before["arm_loss"])
+
+
+def test_gr1_learns_no_action_of_play_that_is_not_its_commands(tmp_path):
+    sentences = ["lift the red block"] * 3 + ["lift the blue block"] * 15 + [NO_COMMAND] * 6
+    make_dataset(tmp_path / "play", "rel", 1, sentences=sentences)
+    meta = LeRobotDatasetMetadata("test/squares", root=tmp_path / "play")
+    policy, prepare, _ = make("gr1", dataset_meta=meta, static_shift=0, gripper_shift=0, dropout=0.0)
+    batch = prepare(windows("gr1", policy, {"rel": tmp_path / "play"}, [0, 18]))
+    before = policy.forward(batch)[1]
+    batch["action"][0, 3:] = batch["action"][1] = 5  # of another command, and of none
+    assert policy.forward(batch)[1] == pytest.approx(before, rel=1e-5)
+    batch["action"][0, 2] = 5
+    assert policy.forward(batch)[1]["arm_loss"] != pytest.approx(before["arm_loss"])
+    alone = {key: value[1:] for key, value in batch.items() if isinstance(value, torch.Tensor | list)}
+    nothing = policy.forward(alone)[1]
+    assert nothing["arm_loss"] == nothing["gripper_loss"] == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [("hulc", "bins", 11), ("mcil", "clip", ClipConfig("lansar-desk", "")), ("gr1", "image_encoder_weights", "a.pth")],
+)
+def test_what_a_checkpoints_weights_are_made_for_cannot_be_changed_under_them(kind, name, value, datasets, tmp_path):
+    policy, _, _ = make(kind)
+    policy.save_pretrained(tmp_path)
+    meta = LeRobotDatasetMetadata("test/squares", root=datasets[FORMS[kind]])
+    config = policy.config
+    config.pretrained_path = tmp_path
+    type(policy)(config, dataset_meta=meta)
+    setattr(config, name, value)
+    with pytest.raises(ValueError, match=f"--policy.{name}=.* was trained with {name}="):
+        type(policy)(config, dataset_meta=meta)
 
 
 def test_gr1s_image_encoder_is_trained_unless_its_weights_are_given(tmp_path):

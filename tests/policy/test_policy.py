@@ -8,6 +8,7 @@ import torch
 from huggingface_hub import ModelCard
 from torch import nn
 
+import lerobot_lansar.clip.commands as commands_module
 from lerobot_lansar.clip.config import ClipConfig
 from lerobot_lansar.clip.model import Clip, embedding_size
 from lerobot_lansar.policy.configuration_lansar import LanSARConfig
@@ -357,6 +358,37 @@ def test_embeddings_made_with_other_clip_weights_are_refused(tmp_path):
         preprocess(sampled_frames(0))
     with pytest.raises(ValueError, match=r"policy was trained with other weights"):
         ClipStep("lansar-desk", "", weights_sha256="e" * 64).clip("cpu")
+
+
+def test_a_policy_that_reads_only_sentences_outlives_another_image_encoder(monkeypatch):
+    from lerobot_lansar.policy import windows
+
+    windows._current.clear()  # as in a new process
+    told = {images: ClipStep("lansar-desk", "", use_images=images).get_config() for images in (False, True)}
+    before = Clip(ClipConfig("lansar-desk", ""))
+    old = told[False] | {"weights_sha256": before.weights_sha256}  # as checkpoints said it once
+    assert ClipStep(**old).clip().text_sha256 == before.text_sha256
+
+    def altered(*arguments, **options):
+        clip = Clip(*arguments, **options)
+        next(clip.model.visual.parameters()).data.add_(1)
+        return clip
+
+    monkeypatch.setattr(commands_module, "Clip", altered)
+    assert ClipStep(**told[False]).clip().weights_sha256 != before.weights_sha256
+    with pytest.raises(ValueError, match="policy was trained with other weights"):
+        ClipStep(**told[True]).clip()
+
+
+def test_under_adapters_the_base_policy_stays_as_it_was_saved():
+    policy = make_policy(use_images=False, mlp_norm="batch")
+    norms = [module for module in policy.modules() if isinstance(module, torch.nn.modules.batchnorm._BatchNorm)]
+    policy.train()
+    assert norms
+    assert all(norm.training for norm in norms)
+    policy.config.use_peft = True  # LeRobot's mark of a policy whose adapters alone are saved
+    policy.train()
+    assert not any(norm.training for norm in norms)
 
 
 def test_a_trained_image_encoder_begins_as_clips_and_gets_gradients_from_every_step():

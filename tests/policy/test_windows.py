@@ -123,23 +123,29 @@ def test_relative_and_absolute_actions_teach_the_same(relative, absolute):
     assert np.abs(make_windows(absolute[0]).targets[:, 3:6]).max() < 0.05  # the roll crosses pi, its change does not
 
 
-def test_windows_of_a_demonstration_start_where_the_rule_says(relative):
+@pytest.mark.parametrize("target", ["commanded", "achieved"])
+def test_windows_of_a_demonstration_start_where_the_rule_says(relative, target):
+    lacking = int(target == "achieved")  # the last frame belongs to no window then
     index = np.arange(sum(LENGTHS))
     starts = {}
     for rule in ("episode", "anywhere", "mixed"):
-        start, end = make_windows(relative[0], window_start=rule).bounds(index)
+        start, end = make_windows(relative[0], window_start=rule, target=target).bounds(index)
         assert (end - start).max() == 64
+        assert (end - start).min() > 0
         starts[rule] = start
         for number, first in enumerate(STARTS):  # never across a demonstration's bounds
             rows = slice(first, first + LENGTHS[number])
             assert start[rows].min() == first
-            assert end[rows].max() == first + LENGTHS[number]
+            assert end[rows].max() == first + LENGTHS[number] - lacking
+        if rule == "episode":
+            assert set(end - start) == {min(length - lacking, 64) for length in LENGTHS}
     short, long = slice(STARTS[0], STARTS[1]), slice(STARTS[1], STARTS[2])
     assert (starts["episode"][short] == STARTS[0]).all()
     offsets, counts = np.unique(starts["episode"][long] - STARTS[1], return_counts=True)
-    assert offsets.tolist() == list(range(90 - 64 + 1))  # first and last 64 steps included
-    assert counts.max() - counts.min() <= 1, "every start equally often"
-    assert (starts["anywhere"] == index).all()
+    assert offsets.tolist() == list(range(90 - lacking - 64 + 1))  # first and last 64 steps included
+    assert counts.max() - counts.min() <= 1 + lacking, "every start equally often"
+    lasts = np.array(STARTS) + LENGTHS - 1
+    assert (starts["anywhere"] == index - lacking * np.isin(index, lasts)).all()
     even = index % 2 == 0
     assert (starts["mixed"][even] == starts["episode"][even]).all()
     assert (starts["mixed"][~even] == starts["anywhere"][~even]).all()

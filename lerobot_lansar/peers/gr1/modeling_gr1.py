@@ -13,12 +13,34 @@ from torch import Tensor
 
 from ...clip.commands import CLIP_COMMAND
 from ...clip.store import IMAGE_FEATURES
-from ..inputs import check_actions, check_control_mode, pictures_of, resize, shift
+from ...datasets import NO_COMMAND
+from ...trained_options import check_trained_options
+from ..inputs import check_actions, check_control_mode, command_ends, pictures_of, resize, shift
 from .configuration_gr1 import GR1Config
 from .network import GR1Network, Seen
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """ImageNet's, by which pictures are normalised."""
+
+
+TRAINED_OPTIONS = (
+    "image_encoder",
+    "image_encoder_layers",
+    "image_encoder_weights",
+    "image_size",
+    "hidden",
+    "layers",
+    "heads",
+    "window",
+    "patch_tokens",
+    "resampler_layers",
+    "resampler_heads",
+    "resampler_head_size",
+    "picture_layers",
+    "picture_heads",
+    "clip",
+)
+"""Options that must stay as a checkpoint was trained, because its weights depend on them."""
 
 
 @dataclass
@@ -47,8 +69,12 @@ class GR1Policy(PreTrainedPolicy):
     def __init__(self, config: GR1Config, dataset_meta: Any = None, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
+        self._command_ends: Tensor | None = None  # in training only
+        if dataset_meta is not None:
+            check_trained_options(config, TRAINED_OPTIONS)
         if dataset_meta is not None and not config.video_only:
             check_actions(dataset_meta.features, config.control_mode)
+            self._command_ends = torch.from_numpy(command_ends(dataset_meta.root))
         self.network = GR1Network(config.network)
         if config.image_encoder_weights:
             if dataset_meta is not None and not config.pretrained_path:  # a checkpoint has its own
@@ -73,7 +99,7 @@ class GR1Policy(PreTrainedPolicy):
         Args:
             batch: Preprocessed: observation.images.* (B, T + later, 3, H, W) in [0, 1], observation.*_is_pad (B, T +
                 later), observation.clip.command (B, D); unless `video_only` also observation.state (B, T + later, 15),
-                action (B, T, 7) and action_is_pad (B, T).
+                action (B, T, 7), action_is_pad (B, T), task (B sentences) and index (B,).
 
         Returns:
             The loss, (); its terms.
@@ -88,23 +114,35 @@ class GR1Policy(PreTrainedPolicy):
         command = self.network.read_command(batch[CLIP_COMMAND])
         answers = self.network(Seen(command, torch.cat(tokens, dim=2)), questions)
         losses, terms = [], {}
+        commanded = self._commanded(batch, command.device)
         if not config.video_only:
-            valid, target = ~batch["action_is_pad"], batch[ACTION]
+            told = torch.tensor([task != NO_COMMAND for task in batch["task"]], device=commanded.device)
+            valid, target = ~batch["action_is_pad"] & commanded[:, :steps] & told[:, None], batch[ACTION]
             arm, gripper = self.network.actions(answers["action"])
             opens = (target[..., 6][valid] > 0).float()
-            terms["arm_loss"] = F.smooth_l1_loss(arm[valid], target[..., :6][valid])
-            terms["gripper_loss"] = F.binary_cross_entropy_with_logits(gripper[valid], opens)
+            count = max(1, int(valid.sum()))  # of play, a batch may hold no command
+            terms["arm_loss"] = F.smooth_l1_loss(arm[valid], target[..., :6][valid], reduction="sum") / (6 * count)
+            gripper_loss = F.binary_cross_entropy_with_logits(gripper[valid], opens, reduction="sum")
+            terms["gripper_loss"] = gripper_loss / count
             losses += [terms["arm_loss"], config.gripper_weight * terms["gripper_loss"]]
         for name in pictures if config.picture_weight else ():
             # LeRobot's names of these flags follow the dataset's names of the cameras; all of them are the same.
             ended = next(v for k, v in batch.items() if k.startswith("observation.") and k.endswith("_is_pad"))
-            valid = ~ended[:, config.later :]
+            valid = ~ended[:, config.later :] & commanded[:, config.later :]
             drawn = self.network.draw(answers[name][valid])
             error = (drawn - self.network.cut(pictures[name][:, config.later :][valid])) ** 2
             # Every process of a training reports the same terms, also where no window reaches so far.
             terms[f"{name}_picture_loss"] = error.sum() / max(1, error.numel())
             losses.append(config.picture_weight * terms[f"{name}_picture_loss"])
         return torch.stack(losses).sum(), {name: term.item() for name, term in terms.items()}
+
+    def _commanded(self, batch: dict[str, Any], device: torch.device) -> Tensor:
+        """Which steps of a window are still of its first frame's command, (B, T + later)."""
+        steps = torch.arange(self.config.window + self.config.later, device=device)
+        if self._command_ends is None:
+            return (steps >= 0).expand(len(batch[CLIP_COMMAND]), -1)
+        index = batch["index"].flatten().cpu()
+        return steps < (self._command_ends[index] - index).to(device)[:, None]
 
     def _prepare(self, window: Tensor, camera: str) -> Tensor:
         """(B, T, 3, H, W) in [0, 1] -> (B, T, 3, S, S) as the image encoder reads them, in training moved."""

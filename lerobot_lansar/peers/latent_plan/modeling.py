@@ -12,6 +12,7 @@ from torch import Tensor
 from ...clip.commands import CLIP_COMMAND
 from ...clip.store import IMAGE_FEATURES
 from ...datasets import NO_COMMAND
+from ...trained_options import check_trained_options
 from ..inputs import check_actions, check_control_mode, command_ends, pictures_of, resize, shift
 from .configuration import LatentPlanConfig
 from .hand_frame import to_hand, to_world
@@ -20,6 +21,29 @@ from .network import LatentPlanNetwork
 
 MEAN = STD = 0.5
 """Pictures are fed to the network as (picture - MEAN) / STD."""
+
+
+TRAINED_OPTIONS = (
+    "static_size",
+    "gripper_size",
+    "visual_features",
+    "goal_features",
+    "hidden",
+    "plan",
+    "plan_size",
+    "plan_classes",
+    "recognition",
+    "recognition_layers",
+    "recognition_heads",
+    "recognition_features",
+    "mixtures",
+    "bins",
+    "action_frame",
+    "decoder_sees",
+    "control_mode",
+    "clip",
+)
+"""Options that must stay as a checkpoint was trained, because its weights depend on them."""
 
 
 @dataclass
@@ -61,6 +85,7 @@ class LatentPlanPolicy(PreTrainedPolicy):
         config.validate_features()
         self._command_ends: Tensor | None = None  # in training only
         if dataset_meta is not None:
+            check_trained_options(config, TRAINED_OPTIONS)
             check_actions(dataset_meta.features, config.control_mode)
             self._command_ends = torch.from_numpy(command_ends(dataset_meta.root))
         self.network = LatentPlanNetwork(config.network)
