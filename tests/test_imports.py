@@ -20,7 +20,7 @@ FLOORS = [
         "lerobot_lansar.jobs",
         "lerobot_lansar.paths",
     ),
-    ("lerobot_lansar.clip",),
+    ("lerobot_lansar.clip", "lerobot_lansar.trained_options"),
     (
         "lerobot_lansar.desk",
         "lerobot_lansar.policy",
