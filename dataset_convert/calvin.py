@@ -20,8 +20,7 @@ import numpy as np
 from dataset_convert.frames import frame_file, frame_numbers, read_frame
 from dataset_convert.language import LANG_FOLDER, find_faults, language_file, read_windows
 from dataset_convert.look import read_look
-from dataset_convert.safe_pickle import parse_npy, read_index_file
-from dataset_convert.scenes import find_scenes
+from dataset_convert.scenes import find_scenes, read_recordings
 
 
 class CalvinSplit:
@@ -65,7 +64,7 @@ class CalvinSplit:
             )
         self.look = read_look(self.folder)
         index = self.folder / "ep_start_end_ids.npy"
-        self.recordings = _read_recordings(index)
+        self.recordings = read_recordings(index)
         scenes = find_scenes(self.folder, self.recordings, scene)
         self.scenes, self.scenes_from = scenes.ranges, scenes.source
         self.language = language_file(self.folder, lang_folder)
@@ -110,16 +109,3 @@ class CalvinSplit:
             for key, array in read_frame(self.frame_file(frame), columns, self.look.image_size).items():
                 columns[key].append(array)
         return {key: np.stack(column) for key, column in columns.items()}
-
-
-def _read_recordings(path: Path) -> np.ndarray:
-    content = read_index_file(path)
-    try:
-        recordings = parse_npy(content).reshape(-1, 2)
-        if recordings.dtype.kind not in "iu" or not len(recordings):
-            raise ValueError(f"found {recordings.dtype} {recordings.shape}")
-        if (recordings < 0).any() or (recordings[:, 1] < recordings[:, 0]).any():
-            raise ValueError("a recording ends before it begins")
-    except Exception as error:  # damaged bytes make numpy's header parser raise nearly anything
-        raise ValueError(f"{path}: expected (N, 2) first and last frame numbers ({error!r})") from error
-    return recordings[np.argsort(recordings[:, 0])].astype(np.int64)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dataset_convert.frames import STATES, frame_file, read_frame
-from dataset_convert.safe_pickle import load_object_array
+from dataset_convert.safe_pickle import load_object_array, parse_npy, read_index_file
 
 VALIDATION_SCENE = "D"
 """The scene of every public validation split, whatever its training split was recorded in."""
@@ -68,6 +68,25 @@ def find_scenes(folder: Path, recordings: np.ndarray, chosen: str) -> Scenes:
     raise FileNotFoundError(f"{own} is missing: if all of the split was recorded in one scene, name it: --scene=…")
 
 
+def read_recordings(path: Path) -> np.ndarray:
+    """A split's (N, 2) first and last frame of each uninterrupted recording, in order, from `ep_start_end_ids.npy`.
+
+    Raises:
+        FileNotFoundError: The file is missing.
+        ValueError: It is malformed.
+    """
+    content = read_index_file(path)
+    try:
+        recordings = parse_npy(content).reshape(-1, 2)
+        if recordings.dtype.kind not in "iu" or not len(recordings):
+            raise ValueError(f"found {recordings.dtype} {recordings.shape}")
+        if (recordings < 0).any() or (recordings[:, 1] < recordings[:, 0]).any():
+            raise ValueError("a recording ends before it begins")
+    except Exception as error:  # damaged bytes make numpy's header parser raise nearly anything
+        raise ValueError(f"{path}: expected (N, 2) first and last frame numbers ({error!r})") from error
+    return recordings[np.argsort(recordings[:, 0])].astype(np.int64)
+
+
 def read_scenes(path: Path) -> dict[str, tuple[int, int]]:
     """Scene letter to its (first, last) frame, as a file says it.
 
@@ -109,7 +128,9 @@ def _within(ranges: dict[str, tuple[int, int]], recordings: np.ndarray) -> dict[
 
 
 def _numbers_agree(folder: Path, training: Path, recordings: np.ndarray) -> bool:
-    """Whether the split's frames are numbered together with training's: some are in both, and all of those agree.
+    """Whether the split's frames are numbered together with training's: those in both agree.
+
+    If there are none in both, the recordings of the two must at least have different numbers.
 
     On ABC->D they are not: training's numbers begin anew at 0 and name frames of other scenes than validation's.
     """
@@ -126,4 +147,8 @@ def _numbers_agree(folder: Path, training: Path, recordings: np.ndarray) -> bool
         compared = True
         if not all(np.array_equal(mine[key], theirs[key]) for key in STATES):
             return False
-    return compared
+    index = training / "ep_start_end_ids.npy"
+    if compared or not index.is_file():
+        return compared
+    others = read_recordings(index)
+    return not any(((others[:, 0] <= last) & (others[:, 1] >= first)).any() for first, last in recordings)

@@ -297,14 +297,12 @@ class Thesis:
         with ThreadPoolExecutor(1) as gpu:  # the GPU is idle while the cores record
             measuring = gpu.submit(self.measure)
             try:
-                self.record()
-            except StepError as error:
-                self.problems.append(str(error))
-            except BaseException:  # Ctrl-C, or a batch system's signal: it must not wait for the measurement
+                self.attempt(self.record)
+                measuring.result()
+            except BaseException:  # Ctrl-C, or a batch system's signal
                 for process in list(running):
                     end(process)
                 raise
-            measuring.result()
         if (self.dataset / "meta/info.json").exists():
             evaluating = SHARES["evaluate"] * self.seconds / len(ROWS)
             for number, name in enumerate(ROWS):

@@ -7,9 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import yaml
+from draccus.cfgparsing import load_config
 from huggingface_hub import hf_hub_download
-from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import DEFAULT_DEPTH_UNIT, PreTrainedConfig, parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
@@ -106,17 +105,12 @@ def trained_depth_unit() -> str:
     policy, option = parser.get_path_arg("policy"), "depth_output_unit"
     if _option("dataset.repo_id") is not None or policy is None:
         return _option(f"dataset.{option}") or DEFAULT_DEPTH_UNIT
-    return _file_beside(policy, TRAIN_CONFIG_NAME).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
+    return _training_of(policy).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
 
 
-def wanted_device() -> str | None:
-    """The device that the command or its policy's own configuration names, whether or not this machine has it.
-
-    LeRobot replaces a device that is missing here by another, although jobs may run on machines that have it.
-    """
-    policy = parser.get_path_arg("policy")
-    named = _option("policy.device")
-    return named or (None if policy is None else _file_beside(policy, CONFIG_NAME).get("device"))
+def named_device() -> str | None:
+    """`--policy.device` of the command, whether or not this machine has it; None without one."""
+    return _option("policy.device")
 
 
 def evaluated_policy() -> str | None:
@@ -131,12 +125,12 @@ def evaluated_policy() -> str | None:
     return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
 
 
-def _file_beside(policy: str, name: str) -> dict[str, Any]:
-    """A JSON file beside a policy's weights, in a folder or on the hub; empty without one."""
-    file = Path(policy, name)
+def _training_of(policy: str) -> dict[str, Any]:
+    """The options with which LeRobot trained a policy, from the file that it keeps beside it; empty without one."""
+    file = Path(policy, TRAIN_CONFIG_NAME)
     if not Path(policy).is_dir():
         try:
-            file = Path(hf_hub_download(policy, name))
+            file = Path(hf_hub_download(policy, TRAIN_CONFIG_NAME))
         except (OSError, ValueError):  # no such file there, or no hub
             return {}
     return json.loads(file.read_text()) if file.is_file() else {}
@@ -174,8 +168,12 @@ def _trained_shapes() -> dict[str, tuple[int, ...]]:
 
 def _option(name: str) -> Any:
     """The value of an option such as `policy.type`; None if neither command line nor `--config_path` has it."""
-    value, file = parser.parse_arg(name), parser.parse_arg("config_path")
-    if value is not None or file is None or not Path(file).is_file():
+    value, path = parser.parse_arg(name), parser.parse_arg("config_path")
+    if value is not None or path is None:
         return value
+    file = Path(path, TRAIN_CONFIG_NAME) if Path(path).is_dir() else Path(path)  # a checkpoint to resume
+    if not file.is_file():
+        return None
     section, _, key = name.partition(".")
-    return ((yaml.safe_load(Path(file).read_text()) or {}).get(section) or {}).get(key)
+    with file.open() as stream:
+        return ((load_config(stream, file=file) or {}).get(section) or {}).get(key)

@@ -72,6 +72,8 @@ def _evaluate(config: EvaluateConfig) -> Path:
     env_options = desk.gym_kwargs
     env_options["results_extra"] = {**env_options["results_extra"], "policy_reset": "command"}
     before = _earlier(config)
+    if before:  # the same weights, although they may lie elsewhere by now
+        env_options["results_extra"]["policy"] = before["policy"]
     episodes = planned(config)
     done = {episode.key for episode in read_lines(folder)}
     missing = [episode for episode in episodes if (episode.task, episode.seed) not in done]
@@ -83,8 +85,9 @@ def _evaluate(config: EvaluateConfig) -> Path:
     config.workers = min(config.workers or 1, max(1, len(missing)))
     executor = config.executor if missing else "local"
     described = _described(config)
-    if before and not missing:
-        described |= {key: before[key] for key in ("command", "hardware", "seconds")}
+    if before:
+        kept = ("policy",) if missing else ("policy", "command", "hardware", "seconds")
+        described |= {key: before[key] for key in kept}
     write_atomically(folder / PLAN_FILE, json.dumps(described, indent=2) + "\n")
     _make_paths_absolute(config, env_options)
     seconds = before.get("seconds", 0.0)  # None: a run was killed, or jobs played

@@ -8,7 +8,7 @@ from lerobot.configs.eval import EvalPipelineConfig
 
 from ..benchmark import LH_MTLC
 from ..command import CommandError
-from ..envs.command_line import wanted_device
+from ..envs.command_line import named_device
 from ..envs.configuration_calvin import CalvinEnvConfig
 from ..jobs.executors import check_executor
 from ..jobs.pool import usable_cores
@@ -52,7 +52,7 @@ class EvaluateConfig(EvalPipelineConfig):
             raise CommandError("give --output_dir: an interrupted evaluation goes on in it")
         super().__post_init__()
         if self.policy is not None and self.executor != "local":
-            self.policy.device = wanted_device() or self.policy.device
+            self.policy.device = named_device() or self.policy.device  # jobs may have what this machine lacks
         if self.workers is None:
             on_cpu = self.policy is None or self.policy.device in (None, "cpu")
             self.workers = usable_cores() if on_cpu else 1

@@ -4,6 +4,7 @@ An entry says on which desk it was measured, so that results on built-in assets 
 other origin in the card are left as they are.
 """
 
+import json
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,9 @@ SOURCE = "lerobot_policy_lansar"
 """Name of the source in every entry of ours; by it a later push finds them."""
 
 SOURCE_URL = "https://pypi.org/project/lerobot_policy_lansar"
+
+_PROGRESS = ("episodes", "missing", "last_seed", "version")
+"""Entries of `protocol` in which a finished evaluation may differ from what it was before."""
 
 DESKS = {"original": "CALVIN's original assets", "built-in": "built-in desk, not comparable with CALVIN"}
 
@@ -53,7 +57,7 @@ def model_index(row: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _configuration(row: dict[str, Any]) -> str:
-    """What evaluations must share for the later one to replace the earlier one in the card."""
+    """What was evaluated, in words by which the hub groups results."""
     chains = row["kind"] != "single tasks"
     tasks = LH_MTLC if chains else "all tasks" if len(row["tasks"]) == len(TASKS) else ", ".join(sorted(row["tasks"]))
     planned = row["episodes"] + (row["missing"] or 0)
@@ -166,4 +170,5 @@ def merge_index(old: Any, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _place(result: dict[str, Any]) -> tuple[Any, ...]:
     """What a later push of the same evaluation has in common with an earlier one."""
     dataset, source = result.get("dataset") or {}, result.get("source") or {}
-    return source.get("name"), dataset.get("type"), dataset.get("config")
+    args = {key: value for key, value in (dataset.get("args") or {}).items() if key not in _PROGRESS}
+    return source.get("name"), dataset.get("type"), dataset.get("config"), json.dumps(args, sort_keys=True)

@@ -75,6 +75,8 @@ def test_trainings_scenes_are_believed_only_where_their_numbers_are_validations(
     for file in training.folder.glob("episode_*.npz"):  # not downloaded: nothing speaks for training's scenes
         file.unlink()
     assert CalvinSplit(validation.root, "validation").scenes == {"D": (5, 52)}
+    np.save(training.folder / "ep_start_end_ids.npy", [[100, 147]])  # validation's frames were moved out of it
+    assert CalvinSplit(validation.root, "validation").scenes == {"C": (5, 52)}
 
 
 def test_a_scene_is_asked_for_where_nothing_can_tell_it(tmp_path):

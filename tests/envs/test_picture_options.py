@@ -111,10 +111,12 @@ def test_depth_has_the_unit_in_which_the_policy_was_trained(tmp_path, monkeypatc
     config = CalvinEnvConfig(depth=True)
     evaluation = policy(tmp_path, static_depth=[1, 200, 200])
     training = ["lerobot-train", "--policy.type=act", "--dataset.repo_id=you/desk"]
-    resumed = tmp_path / "resumed.json"
+    resumed = tmp_path / "resumed" / "train_config.json"
+    resumed.parent.mkdir()
     resumed.write_text(json.dumps({"dataset": {"repo_id": "you/desk", "depth_output_unit": "m"}}))
     for arguments, unit in (
         (["lerobot-train", f"--config_path={resumed}", "--resume=true"], "m"),
+        (["lerobot-train", f"--config_path={resumed.parent}", "--resume=true"], "m"),
         (evaluation, "mm"),
         (training, "mm"),
         ([*training, "--dataset.depth_output_unit=m"], "m"),
@@ -129,10 +131,10 @@ def test_depth_has_the_unit_in_which_the_policy_was_trained(tmp_path, monkeypatc
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")
-def test_jobs_run_on_the_device_that_is_wanted_even_if_this_machine_lacks_it(tmp_path, monkeypatch):
+def test_jobs_run_on_the_device_that_is_named_even_if_this_machine_lacks_it(tmp_path, monkeypatch):
     arguments = policy(tmp_path)
-    for config, option, device in (("cuda", [], "cuda"), ("cuda", ["--policy.device=cpu"], "cpu")):
-        (tmp_path / "config.json").write_text(json.dumps({"type": "act", "device": config}))
+    (tmp_path / "config.json").write_text(json.dumps({"type": "act", "device": "cuda"}))
+    for option, device in (([], "cpu"), (["--policy.device=cuda"], "cuda"), (["--policy.device=cpu"], "cpu")):
         monkeypatch.setattr(sys, "argv", [*arguments, *option])
         options = {"env": CalvinEnvConfig(), "output_dir": tmp_path}
         assert EvaluateConfig(**options, executor="slurm").policy.device == device

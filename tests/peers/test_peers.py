@@ -296,7 +296,12 @@ def test_gr1_learns_no_action_of_play_that_is_not_its_commands(tmp_path):
 
 @pytest.mark.parametrize(
     ("kind", "name", "value"),
-    [("hulc", "bins", 11), ("mcil", "clip", ClipConfig("lansar-desk", "")), ("gr1", "image_encoder_weights", "a.pth")],
+    [
+        ("hulc", "bins", 11),
+        ("hulc", "gripper_weight", 0.0),
+        ("mcil", "clip", ClipConfig("lansar-desk", "")),
+        ("gr1", "image_encoder_weights", "a.pth"),
+    ],
 )
 def test_what_a_checkpoints_weights_are_made_for_cannot_be_changed_under_them(kind, name, value, datasets, tmp_path):
     policy, _, _ = make(kind)

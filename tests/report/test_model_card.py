@@ -136,13 +136,18 @@ def test_evaluations_of_other_desks_and_settings_are_different_datasets(tmp_path
     assert ours[0]["dataset"]["type"] == unknown[0]["dataset"]["type"] == "calvin-built-in-desk"
     assert "CALVIN's original assets" in calvin[0]["dataset"]["name"]
     assert "unknown desk, not comparable with CALVIN" in unknown[0]["dataset"]["name"]
-    disturbed = results_of(write_lines(tmp_path / "disturbed", [chain_line(0, 2)], perturbation_every=5))
+    disturbed = [
+        results_of(
+            write_lines(tmp_path / f"{scale}", [chain_line(0, 2)], perturbation_every=5, perturbation_scale=scale)
+        )
+        for scale in (0.5, 2.5)
+    ]
     more = results_of(write_lines(tmp_path / "more", [chain_line(k, 2) for k in range(2)]))
     again = results_of(write_lines(tmp_path / "again", [chain_line(0, 3)]))
     index: list = []
-    for results in (ours, calvin, disturbed, more, again):
+    for results in (ours, calvin, *disturbed, more, again):
         index = merge_index(index, [{"name": "policy", "results": results}])
-    assert index[0]["results"] == [*calvin, *disturbed, *more, *again], "only the same is replaced"
+    assert index[0]["results"] == [*calvin, *disturbed[0], *disturbed[1], *more, *again], "only the same is replaced"
 
 
 def test_single_tasks_are_pushed_as_a_whole_and_by_group(tmp_path):

@@ -36,6 +36,7 @@ TRAINED_OPTIONS = (
     "recognition_layers",
     "recognition_heads",
     "recognition_features",
+    "window",
     "mixtures",
     "bins",
     "action_frame",
@@ -85,7 +86,7 @@ class LatentPlanPolicy(PreTrainedPolicy):
         config.validate_features()
         self._command_ends: Tensor | None = None  # in training only
         if dataset_meta is not None:
-            check_trained_options(config, TRAINED_OPTIONS)
+            check_trained_options(config, TRAINED_OPTIONS, ("gripper_weight", "contrastive_weight"))
             check_actions(dataset_meta.features, config.control_mode)
             self._command_ends = torch.from_numpy(command_ends(dataset_meta.root))
         self.network = LatentPlanNetwork(config.network)
