@@ -24,9 +24,10 @@ env=NAME is --env.type=NAME. lerobot COMMAND --help lists a command's options.
 
 
 def commands() -> dict[str, Path]:
-    """LeRobot's commands installed beside this Python, by the word after `lerobot-`."""
-    scripts = Path(sysconfig.get_path("scripts"))
-    return {path.stem.removeprefix("lerobot-"): path for path in sorted(scripts.glob("lerobot-*"))}
+    """LeRobot's commands installed beside this Python or, as pip does where it may not write, for the user."""
+    folders = [sysconfig.get_path("scripts", sysconfig.get_preferred_scheme("user")), sysconfig.get_path("scripts")]
+    found = {path.stem.removeprefix("lerobot-"): path for f in folders for path in Path(f).glob("lerobot-*")}
+    return dict(sorted(found.items()))
 
 
 def translate(command: str, arguments: list[str]) -> list[str]:

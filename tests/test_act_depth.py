@@ -71,3 +71,6 @@ def test_depth_is_scaled_by_the_datasets_statistics():
     scaled = prepare({**batch(4500.0), "task": ["", ""]})
     assert scaled[DEPTH].shape == (2, 1, SIZE, SIZE)
     assert scaled[DEPTH].mean() == pytest.approx(1, abs=1e-4)
+    stats[DEPTH] = stats[COLORS]  # what LeRobot's eval_split makes of it
+    with pytest.raises(ValueError, match=r"add --dataset\.use_imagenet_stats=false"):
+        make_pre_post_processors(policy.config, dataset_stats=stats)

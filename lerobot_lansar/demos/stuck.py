@@ -61,12 +61,16 @@ class Watch:
         self._frames = self._still = self._loose = 0
         self._where: np.ndarray | None = None
         self._carried: str | None = None
+        held, commanded = start.held, TASKS[task]
+        goes_on = commanded.kind in ("place_block", "stack_block") or commanded.color == held
+        self._to_put_down = None if goes_on else held
 
     def is_stuck(self, obs: Observation, now: Snapshot) -> bool:
         """Whether the policy needs help, after its next step; call it once per step.
 
-        It does if it takes too long, if nothing moves, if it lost the block that it had in its hand, or if the oracle
-        sees that it did something else: the same task to the other side or with another block, or moved furniture.
+        It does if it takes too long, if nothing moves, if it lost the block that it had in its hand (not one from the
+        command before, which it has to put down), or if the oracle sees that it did something else: the same task to
+        the other side or with another block, or moved furniture.
         """
         self._frames += 1
         self._see_movement(obs)
@@ -89,7 +93,7 @@ class Watch:
 
     def _see_carried(self, now: Snapshot) -> None:
         held = now.held
-        if held is not None:
+        if held is not None and held != self._to_put_down:
             self._carried, self._loose = held, 0
         elif self._carried is not None and "robot" not in now.blocks[self._carried].bodies:
             self._loose += 1

@@ -102,10 +102,13 @@ def trained_depth_unit() -> str:
 
     A training command's own `--dataset.depth_output_unit`, or that of the training that made `--policy.path`.
     """
-    policy, option = parser.get_path_arg("policy"), "depth_output_unit"
+    policy, names = parser.get_path_arg("policy"), ("depth_output_unit", "eval_split")
     if _option("dataset.repo_id") is not None or policy is None:
-        return _option(f"dataset.{option}") or DEFAULT_DEPTH_UNIT
-    return _training_of(policy).get("dataset", {}).get(option, DEFAULT_DEPTH_UNIT)
+        unit, held_out = (_option(f"dataset.{name}") for name in names)
+    else:
+        unit, held_out = map((_training_of(policy).get("dataset") or {}).get, names)
+    # With a held-out split, LeRobot 0.6 takes no notice of the option.
+    return DEFAULT_DEPTH_UNIT if unit is None or float(held_out or 0) > 0 else unit
 
 
 def named_device() -> str | None:

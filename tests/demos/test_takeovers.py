@@ -250,8 +250,8 @@ def test_a_policy_is_stuck_when_it_is_late_still_loses_a_block_or_does_something
         obs = desk.reset()
         start = desk.snapshot()
 
-    def first(task, snapshots, patience=10.0, moving=True):
-        watch, seen = Watch(task, start, patience), {**obs, "robot_obs": obs["robot_obs"].copy()}
+    def first(task, snapshots, patience=10.0, moving=True, begun=start):
+        watch, seen = Watch(task, begun, patience), {**obs, "robot_obs": obs["robot_obs"].copy()}
         for number, now in enumerate(snapshots, 1):
             seen["robot_obs"] = seen["robot_obs"] + (0.01 if moving else 0.0)
             if watch.is_stuck(seen, now):
@@ -266,6 +266,9 @@ def test_a_policy_is_stuck_when_it_is_late_still_loses_a_block_or_does_something
     assert first("turn_on_led", [start] * 300, moving=False) == STILL_FRAMES + 1
     assert first("stack_block", [held] * 20 + [start] * 100) == 20 + LOOSE_FRAMES
     assert first("stack_block", [held] * 100) is None
+    for task in ("stack_block", "lift_red_block_table"):
+        assert first(task, [held] * 20 + [start] * 100, begun=held) == 20 + LOOSE_FRAMES
+    assert first("turn_on_led", [held] * 20 + [start] * 100, begun=held) is None, "it has to put the block down"
     opened = replace(start, drawer=start.drawer + 0.2)
     assert first("turn_on_led", [start] * 7 + [opened]) == 8
     assert first("open_drawer", [opened] * 50) is None

@@ -120,6 +120,7 @@ def test_depth_has_the_unit_in_which_the_policy_was_trained(tmp_path, monkeypatc
         (evaluation, "mm"),
         (training, "mm"),
         ([*training, "--dataset.depth_output_unit=m"], "m"),
+        ([*training, "--dataset.depth_output_unit=m", "--dataset.eval_split=0.1"], "mm"),
         ([*training, f"--policy.path={tmp_path}"], "mm"),
     ):
         monkeypatch.setattr(sys, "argv", arguments)

@@ -16,7 +16,12 @@ visuals          the triangles, colours and textures of all bodies
 kinematics       where links are, from joint positions
 """
 
+import os
+import shutil
+import sys
+import tempfile
 from collections.abc import Collection
+from multiprocessing.util import Finalize
 from typing import Protocol
 
 import numpy as np
@@ -41,6 +46,27 @@ class Renderer(Protocol):
         """As `software.SoftwareRenderer.draw`."""
 
 
+def _find_cache() -> None:
+    """Lets numba keep compiled kernels in a temporary folder if it finds no other that it may write to.
+
+    It wants the package's folder or one in the user's home. Processes started later use the same folder.
+    """
+    try:
+        from . import kinematics  # noqa: F401
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        import numba
+
+        folder = tempfile.mkdtemp(prefix="lansar_numba_")
+        Finalize(None, shutil.rmtree, (folder, True), exitpriority=0)
+        os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = folder  # type: ignore[attr-defined]
+        print(
+            "compiling for half a minute, as in each new run: set NUMBA_CACHE_DIR to a folder to keep it",
+            file=sys.stderr,
+        )
+
+
 def open_renderer(
     name: str, client: int, repainted: Collection[tuple[int, int]], egl_plugin: int | None = None
 ) -> Renderer:
@@ -58,6 +84,7 @@ def open_renderer(
     if name not in OURS:
         return BulletRenderer(client, egl_plugin)
     # late: numba and its kernels take a second to load, and not everybody needs pictures
+    _find_cache()
     from .gl_look import OpenGLLook
     from .stage import Stage
     from .tiny_look import TinyLook
