@@ -59,7 +59,7 @@ def frame_numbers(folder: Path) -> np.ndarray:
 
 
 def recorded_arrays(files: Iterable[Path]) -> set[str]:
-    """Names of the arrays that were recorded: those in any of a sample of these frame files, as one may be defective."""
+    """Names of the arrays that were recorded: those in any of a sample of these files, as one may be defective."""
     files, found = list(files), set[str]()
     for file in files[:: max(1, len(files) // _SAMPLE)]:
         try:
