@@ -20,7 +20,7 @@ from lerobot.datasets.video_utils import get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from dataset_convert.frames import TACTILE, shape_of
-from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder
+from dataset_convert.layout import Codec, Layout, Picture, RGBEncoder, camera_sizes
 from dataset_convert.poses import pose_features
 from dataset_convert.stats import Stats
 from lerobot_lansar.calvin import ACTION_NAMES, CAMERAS, CONTROL_HZ, ROBOT_OBS_NAMES, SCENE_OBS_NAMES, TASKS
@@ -137,7 +137,7 @@ def dataset_features(
         other: _vector(ACTION_NAMES[other_form]),
         **{key: {"dtype": "int64", "shape": (1,), "names": None} for key in _NUMBERS},
         **({INTERVENTION_FEATURE: {"dtype": "bool", "shape": (1,), "names": None}} if interventions else {}),
-        **{key: _matrix(numbers) for key, numbers in pose_features(_cameras(pictures), camera_poses).items()},
+        **{key: _matrix(numbers) for key, numbers in pose_features(camera_sizes(pictures), camera_poses).items()},
     }
     for picture in pictures:
         features[picture.key] = {
@@ -148,12 +148,6 @@ def dataset_features(
         if picture.is_depth:
             features[picture.key]["info"] = {"is_depth_map": True, "depth_unit": "m"}
     return {**features, **DEFAULT_FEATURES}
-
-
-def _cameras(pictures: Iterable[Picture]) -> list[str]:
-    """The cameras whose colours are among these features."""
-    keys = {picture.key for picture in pictures}
-    return [camera for camera in CAMERAS if f"observation.images.{camera}" in keys]
 
 
 def _vector(names: Iterable[str]) -> dict:

@@ -1,5 +1,6 @@
 """How a converted dataset lies on disk: its frame tables, camera features, videos and manifest."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,12 @@ class Picture:
         return np.stack([resize(picture, width) for picture in pictures])  # ten times faster than all at once
 
 
+def camera_sizes(pictures: Iterable[Picture]) -> dict[str, int]:
+    """Camera to the width and height of its pictures, of those features that show a camera's colours."""
+    keys = {f"observation.images.{camera}": camera for camera in CAMERAS}
+    return {keys[picture.key]: picture.shape[0] for picture in pictures if picture.key in keys}
+
+
 @dataclass(frozen=True)
 class Layout:
     """How the frame tables and videos look.
@@ -132,8 +139,7 @@ class Layout:
 
     def camera_sizes(self) -> dict[str, int]:
         """Camera to the width and height of its pictures; none if the dataset has no pictures."""
-        keys = {f"observation.images.{camera}": camera for camera in CAMERAS}
-        return {keys[picture.key]: picture.shape[0] for picture in self.pictures if picture.key in keys}
+        return camera_sizes(self.pictures)
 
     def files(self, shard: int) -> list[str]:
         """The shard's frame table and videos, relative to the dataset's folder."""
