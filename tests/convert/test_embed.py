@@ -46,8 +46,8 @@ def run(monkeypatch, capsys):
 
 
 def without_clip(made, images, tmp_path):
-    """A copy without embeddings."""
-    copy = shutil.copytree(made / images, tmp_path / images)
+    """A copy without embeddings, and without `.cache`, which LeRobot does not upload: the lock of the first pass."""
+    copy = shutil.copytree(made / images, tmp_path / images, ignore=shutil.ignore_patterns(".cache"))
     shutil.rmtree(copy / "clip", ignore_errors=True)
     return copy
 
