@@ -26,7 +26,7 @@ from ..envs.command_line import evaluated_policy
 from ..jobs.executors import run_shards
 from ..jobs.pool import usable_cores
 from ..jobs.staging import end_submitted, refuse_submitted, submitted_jobs, write_atomically
-from ..report.episodes import INFO_FILE, PLAN_FILE, read_lines
+from ..report.episodes import INFO_FILE, PLAN_FILE, WEIGHTS, read_lines
 from ..report.episodes import Episode as Played
 from .options import EvaluateConfig
 from .stream import Episode
@@ -222,7 +222,7 @@ def _request(config: EvaluateConfig) -> dict[str, Any]:
     options["env"] = {key: value for key, value in options["env"].items() if key not in _ENV_MAY_CHANGE}
     assert config.policy is not None
     files = sorted(Path(str(config.policy.pretrained_path)).glob("*.safetensors"))
-    options["weights of the policy"] = {file.name: sha256(file) for file in files}
+    options[WEIGHTS] = {file.name: sha256(file) for file in files}
     options["policy"] |= {"pretrained_path": None if files else evaluated_policy()}  # a folder is known by its weights
     if config.desk.annotations is not None:
         options["env"]["annotations"] = sha256(Path(config.desk.annotations))

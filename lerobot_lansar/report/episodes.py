@@ -21,6 +21,8 @@ DEFAULT_SEED = 1000
 
 INFO_FILE = "eval_info.json"
 PLAN_FILE = "eval_config.json"
+WEIGHTS = "weights of the policy"
+"""What `eval_config.json` calls the SHA-256 of the policy's files."""
 
 SETTINGS = (
     "scene",
@@ -86,12 +88,14 @@ class Plan:
         n_episodes: Episodes of every task.
         suites: Name of each suite to its tasks, as in `--env.task`.
         facts: policy, command, hardware, seconds.
+        weights: Name of each of the policy's files to its SHA-256.
     """
 
     seed: int | None = None
     n_episodes: int | None = None
     suites: dict[str, list[str]] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
+    weights: dict[str, str] = field(default_factory=dict)
 
     def expected(self) -> set[tuple[str, int]] | None:
         """The keys of all episodes; None if the plan does not tell."""
@@ -118,6 +122,7 @@ def read_plan(folder: Path) -> Plan:
             None if count is None else int(count),
             {str(suite): [str(task) for task in tasks] for suite, tasks in (content.get("suites") or {}).items()},
             {key: content.get(key) for key in ("policy", "command", "hardware", "seconds")},
+            dict((content.get("request") or {}).get(WEIGHTS) or {}),
         )
     except (ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: not an {PLAN_FILE} of lansar-eval ({error})") from error

@@ -32,6 +32,7 @@ class Part:
         policy: `--policy.path` of the evaluation; None if unknown.
         named: The policy that its own files name, even if the user named another.
         facts: command, hardware and seconds of `eval_config.json`, where known.
+        weights: SHA-256 of the policy's files, where known.
         chains_known: Whether the files or `--seed` say which chains these are.
         videos: Key of an episode to its video, where one exists.
     """
@@ -42,6 +43,7 @@ class Part:
     policy: str | None
     named: str | None
     facts: dict[str, Any]
+    weights: dict[str, str]
     chains_known: bool
     videos: dict[tuple[str, int], Path]
 
@@ -50,6 +52,12 @@ class Part:
         """What parts of one evaluation have in common, the policy apart."""
         settings = {key: agreed(e.settings.get(key) for e in self.episodes) for key in SETTINGS}
         return repr(settings), repr(policy_reset(self.episodes)), kind(self.episodes)
+
+    def same_policy(self, other: "Part") -> bool | None:
+        """By the weights, wherever they lie, or else by the path; None if unknown."""
+        if self.weights and other.weights:
+            return self.weights == other.weights
+        return None if None in (self.policy, other.policy) else self.policy == other.policy
 
 
 @dataclass
@@ -126,6 +134,7 @@ def read_part(folder: Path, seed: int | None = None, policy: str | None = None) 
         policy or named,
         named,
         {key: value for key, value in plan.facts.items() if key != "policy" and value is not None},
+        plan.weights,
         chains_known=plan.seed is not None or bool(lines),
         videos=_videos(folder, episodes, plan, entries),
     )
@@ -192,8 +201,9 @@ def merge(parts: Sequence[Part], label: str = "") -> Evaluation:
         problem = None
         if part.identity != first.identity:
             problem = "have different settings"
-        elif None not in (part.policy, first.policy) and part.policy != first.policy:
-            problem = f"are of different policies, {first.policy} and {part.policy}"
+        elif part.same_policy(first) is False:
+            both = f"policies, {first.policy} and {part.policy}"
+            problem = f"are of different {f'weights of {part.policy}' if part.policy == first.policy else both}"
         elif shared := {e.key for e in part.episodes} & {e.key for p in parts[:i] for e in p.episodes}:
             problem = f"both hold the episode of seed {min(seed for _, seed in shared)}"
         if problem is not None:
@@ -206,7 +216,7 @@ def group(parts: Iterable[Part]) -> list[Evaluation]:
     groups: list[list[Part]] = []
     for part in parts:
         for members in groups:
-            same = part.policy is not None and part.policy == members[0].policy and part.identity == members[0].identity
+            same = part.same_policy(members[0]) and part.identity == members[0].identity
             taken = {e.key for member in members for e in member.episodes}
             if same and taken.isdisjoint(e.key for e in part.episodes):
                 members.append(part)

@@ -74,7 +74,8 @@ def _tables(config: ReportConfig, left_out: list[str]) -> tuple[list[dict[str, A
     pairs = zip(folders, per_folder, strict=True)
     parts = [read_part(Path(name), config.seed, policy) for name, policy in pairs]
     named = sorted({part.named for part in parts if part.named is not None})
-    if isinstance(policies, str) and len(named) > 1:
+    one = all(part.weights and part.weights == parts[0].weights for part in parts)
+    if isinstance(policies, str) and len(named) > 1 and not one:
         raise CommandError(
             f"--policy_path names one policy, but the evaluations name {len(named)}: {', '.join(named)}. Give a list "
             "with one for each folder of --eval_dir, or leave it out"

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from eval_files import chain_line, write_eval, write_lines, write_plan
+from eval_files import chain_line, write_eval, write_lines, write_plan, write_policy
 
 from lerobot_lansar.benchmark import EPISODES_FILE
 from lerobot_lansar.command import CommandError
@@ -25,6 +25,17 @@ def test_parts_of_one_evaluation_are_merged(tmp_path):
     a = lines(tmp_path / "a", [0, 1], policy="p")
     b = lines(tmp_path / "b", [2, 3], policy="p")
     assert groups(a, b) == [[0, 1, 2, 3]]
+
+
+def test_a_policy_is_known_by_its_weights_wherever_they_lie(tmp_path):
+    folders = [lines(tmp_path / name, [seed], policy=policy) for seed, (name, policy) in enumerate(("ap", "bq", "cp"))]
+    for folder, weights in zip(folders, ("1", "1", "2"), strict=True):
+        write_plan(folder, seed=None, request={"weights of the policy": {"model.safetensors": weights}})
+    assert groups(*folders) == [[0, 1], [2]]
+    with pytest.raises(ValueError, match="are of different weights of p"):
+        merge([read_part(folders[0]), read_part(folders[2])])
+    moved = write_policy(tmp_path / "moved", "state")
+    assert report(ReportConfig([str(f) for f in folders[:2]], tmp_path / "out", policy_path=moved))["tables"]
 
 
 @pytest.mark.parametrize(
