@@ -202,10 +202,22 @@ def measure(options: Options, variant: str, seed: int) -> dict[str, Any]:
     return {"variant": variant, "seed": seed, "train_minutes": minutes, **figures, "lengths": lengths}
 
 
+def attempt(options: Options, variant: str, seed: int) -> dict[str, Any] | None:
+    """What `measure` returns; None if that failed, which is said and stops no other run."""
+    try:
+        return measure(options, variant, seed)
+    except Exception as error:
+        tqdm.write(f"{variant}, seed {seed}: {error}")
+        return None
+
+
 def to_first(runs: list[dict[str, Any]], first: list[dict[str, Any]]) -> str:
     """How much longer the chains of one variant are than those of the first with the same seeds."""
-    pairs = list(zip(runs, first, strict=True))
-    chains = sorted(set.intersection(*(set(run["lengths"]) for run in (*runs, *first))))
+    references = {run["seed"]: run for run in first}
+    pairs = [(run, references[run["seed"]]) for run in runs if run["seed"] in references]
+    if not pairs:
+        return ""
+    chains = sorted(set.intersection(*(set(run["lengths"]) for pair in pairs for run in pair)))
     mean = np.mean([[one["lengths"][c] - other["lengths"][c] for c in chains] for one, other in pairs], axis=0)
     (interval,) = bootstrap([mean])
     return f"{mean.mean():+.2f}" + (f" [{interval[0]:+.2f}, {interval[1]:+.2f}]" if interval else "")
@@ -219,13 +231,16 @@ def main() -> None:
         sys.exit(f"--variants: unknown {sorted(unknown)}; choose among {list(known)}")
     runs = [(variant, seed) for seed in options.seeds for variant in options.variants]
     with ThreadPoolExecutor(options.workers) as pool:
-        done = list(tqdm(pool.map(lambda run: measure(options, *run), runs), total=len(runs), unit="run"))
+        found = list(tqdm(pool.map(lambda run: attempt(options, *run), runs), total=len(runs), unit="run"))
+    done = [run for run in found if run is not None]
     settings = {"config": str(options.config), "updates": options.updates, "chains": options.chains}
     (options.output_dir / "results.json").write_text(json.dumps(settings | {"runs": done}, indent=1) + "\n")
     print("| variant | average length | difference to the first | 1 | 2 | 3 | 4 | 5 | per command |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     by_variant = {name: [run for run in done if run["variant"] == name] for name in options.variants}
     for variant, mine in by_variant.items():
+        if not mine:
+            continue
         lengths = [run["average_length"] for run in mine]
         spread = f" ± {statistics.stdev(lengths):.2f}" if len(lengths) > 1 else ""
         row = [100 * statistics.mean(run["in_a_row"][k] for run in mine) for k in range(5)]
@@ -234,6 +249,8 @@ def main() -> None:
         first = by_variant[options.variants[0]]
         change = "" if mine is first else to_first(mine, first)
         print(f"| {variant} | {statistics.mean(lengths):.2f}{spread} | {change} | {shares} | {local:.1f} % |")
+    if len(done) < len(runs):
+        sys.exit(f"{len(runs) - len(done)} of {len(runs)} runs failed; the same command tries them again")
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from lerobot_lansar.calvin import CHAIN_LENGTH, SCENE_NAMES, TASKS
 from lerobot_lansar.demos.demonstrator import demonstrate, fulfil
 from lerobot_lansar.demos.interrupted import finishes, interrupt
 from lerobot_lansar.desk import Desk, SimulationError
+from lerobot_lansar.jobs.staging import write_atomically
 
 SEED = 1_000_000
 
@@ -116,7 +117,7 @@ def code_and_options(options: Options) -> str:
     """A hash of the code and the options that decide the results."""
     package = Path(lerobot_lansar.__file__).parent
     digest = hashlib.sha256(f"{options.starts} {options.assets} {options.interrupt}".encode())
-    for file in sorted((*package.glob("desk/*.py"), *package.glob("demos/**/*.py"))):
+    for file in sorted((package / "calvin.py", *package.glob("desk/*.py"), *package.glob("demos/**/*.py"))):
         digest.update(file.read_bytes())
     return digest.hexdigest()
 
@@ -145,7 +146,7 @@ def main() -> None:
             known[f"{scene} {task}"] = lengths
             if options.output is not None:
                 options.output.parent.mkdir(parents=True, exist_ok=True)
-                options.output.write_text(json.dumps({"state": state, "lengths": known}))
+                write_atomically(options.output, json.dumps({"state": state, "lengths": known}))
     print("| task | " + " | ".join(f"{scene} (%)" for scene in options.scenes) + " | mean frames |")
     print("| --- |" + " ---: |" * (len(options.scenes) + 1))
     for task in TASKS:

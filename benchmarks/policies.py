@@ -7,13 +7,19 @@ Chains of commands are recorded on the built-in desk D with both cameras, and co
 actions, with absolute actions and the commanded task as numbers, and as CLIP embeddings for LanSAR. Nobody but
 `lansar` reads the scene's state (privileged). Each policy trains on one core: a first, short run tells how long its
 updates take, and the number of updates follows from --minutes. Then it plays the benchmark's first chains with
-sentences that no demonstration was labelled with. Whatever is in --data and --output_dir already is not repeated, so
-policies may be measured one after the other; use new folders for other options. Ends with lansar-report's comparison.
+sentences that no demonstration was labelled with. Whatever is in --data and --output_dir already is not repeated, and
+what was interrupted goes on, so policies may be measured one after the other; use new folders for other options. Ends
+with lansar-report's comparison.
+
+The same time is not the same start: `no_space` sees through `lansar-desk`, which was trained on this desk before, while
+the image encoders of all others begin at random. Learning rates follow each policy's own schedule, those that end or
+warm up scaled to the number of updates.
 """
 
 import json
 import re
 import shutil
+import statistics
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -23,7 +29,9 @@ import draccus
 from ablations import command
 from tqdm import tqdm
 
-TRIAL = 20
+from lerobot_lansar.jobs.staging import write_atomically
+
+TRIAL = 60
 """Updates of the run that tells how fast a policy trains; the second half counts."""
 SIZE = 96
 """Width and height of the pictures of all policies but LanSAR, whose CLIP sees them at 112 pixels."""
@@ -40,12 +48,14 @@ class Policy:
         data: The dataset: `relative`, `told` or `embedded`.
         train, evaluate: Options of `lerobot-train` and `lansar-eval`.
         decay: Options that get the number of updates, beside `--steps`.
+        warmup: Options that get a twentieth of it.
     """
 
     data: str
     train: list[str]
     evaluate: list[str]
     decay: tuple[str, ...] = ()
+    warmup: tuple[str, ...] = ()
 
 
 POLICIES = {
@@ -70,6 +80,7 @@ POLICIES = {
         [f"--config_path={CONFIGS / 'peers/gr1_small.yaml'}"],
         ["--env.scene_state=false"],
         ("--policy.decay_steps",),
+        ("--policy.warmup_steps",),
     ),
     "act": Policy(
         "told",
@@ -80,7 +91,7 @@ POLICIES = {
             "--policy.n_heads=4",
             "--policy.dim_feedforward=1024",
             "--policy.chunk_size=32",
-            "--policy.n_action_steps=16",
+            "--policy.n_action_steps=32",
             # LeRobot's 1e-5 is for a trained backbone and a hundred thousand updates; this one begins at random.
             "--policy.optimizer_lr=1e-4",
             "--policy.optimizer_lr_backbone=1e-4",
@@ -93,12 +104,15 @@ POLICIES = {
         [
             "--policy.type=diffusion",
             *OWN,
+            "--policy.horizon=32",
+            "--policy.n_action_steps=16",
             "--policy.down_dims=[64,128,256]",
             "--policy.num_inference_steps=10",
             "--policy.noise_scheduler_type=DDIM",
             "--batch_size=8",
         ],
         TOLD,
+        warmup=("--policy.scheduler_warmup_steps",),
     ),
 }
 CONVERSIONS = {
@@ -130,7 +144,7 @@ def record(options: Options) -> None:
     """The demonstrations, as CALVIN's files and as the datasets that the policies need."""
     options.data.mkdir(parents=True, exist_ok=True)
     log, chains = options.data / "log.txt", options.data / "chains"
-    if not (chains / "training").exists():
+    if not (chains / "validation").exists():  # which appears last
         command(
             "lansar-record",
             "--mode=chains",
@@ -143,26 +157,29 @@ def record(options: Options) -> None:
             log=log,
         )
     for name in {POLICIES[policy].data for policy in options.policies}:
-        if not (options.data / name).exists():
-            command(
-                "lansar-convert",
-                f"--root={chains}",
-                "--split=training",
-                f"--repo_id=lansar/{name}",
-                f"--output_dir={options.data / name}",
-                f"--workers={options.workers}",
-                *CONVERSIONS[name],
-                log=log,
-            )
+        command(  # does nothing if it is done, and goes on if it was interrupted
+            "lansar-convert",
+            f"--root={chains}",
+            "--split=training",
+            f"--repo_id=lansar/{name}",
+            f"--output_dir={options.data / name}",
+            f"--workers={options.workers}",
+            *CONVERSIONS[name],
+            log=log,
+        )
 
 
 def train(options: Options, name: str, folder: Path, updates: int, log_freq: int) -> float:
-    """One training from its beginning; returns the seconds it took."""
+    """One training, from its last checkpoint on if there is one; returns the seconds of an update, reading included."""
     policy = POLICIES[name]
-    shutil.rmtree(folder, ignore_errors=True)
     log = folder.with_suffix(".log")
+    config = folder / "checkpoints/last/pretrained_model/train_config.json"
+    if config.exists():
+        command("lerobot-train", f"--config_path={config}", "--resume=true", log=log)
+        return statistics.mean(seconds_per_update(log))
+    shutil.rmtree(folder, ignore_errors=True)
     log.unlink(missing_ok=True)
-    return command(
+    command(
         "lerobot-train",
         *policy.train,
         f"--dataset.repo_id=lansar/{policy.data}",
@@ -172,26 +189,30 @@ def train(options: Options, name: str, folder: Path, updates: int, log_freq: int
         "--num_workers=0",
         f"--log_freq={log_freq}",
         f"--steps={updates}",
-        f"--save_freq={updates}",
+        f"--save_freq={max(1, updates // 5)}",
         *(f"{option}={updates}" for option in policy.decay),
+        *(f"{option}={updates // 20}" for option in policy.warmup),
         log=log,
     )
+    return statistics.mean(seconds_per_update(log))
 
 
-def seconds_per_update(log: Path) -> float:
-    """What LeRobot says of the last updates: reading the data, and the update itself."""
+def seconds_per_update(log: Path) -> list[float]:
+    """What LeRobot says each `log_freq` updates: reading the data, and the update itself."""
     found = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", log.read_text())
     if not found:
         raise RuntimeError(f"{log} does not say how long an update takes: lerobot-train's lines have changed")
-    return sum(map(float, found[-1]))
+    return [sum(map(float, each)) for each in found]
 
 
 def attempt(options: Options, name: str) -> str | None:
-    """Measures one policy; returns what went wrong."""
+    """Measures one policy; says and returns what went wrong."""
     try:
         measure(options, name)
-    except RuntimeError as error:
-        return f"{name}: {error}"
+    except Exception as error:  # the other policies go on
+        problem = f"{name}: {error}"
+        tqdm.write(problem)
+        return problem
     return None
 
 
@@ -201,12 +222,16 @@ def measure(options: Options, name: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     result = folder / "train.json"
     if not result.exists():
-        train(options, name, folder / "trial", TRIAL, TRIAL // 2)
-        seconds = seconds_per_update(folder / "trial.log")
-        shutil.rmtree(folder / "trial")
-        updates = max(1, round(60 * options.minutes / seconds))
-        minutes = train(options, name, folder / "train", updates, max(1, updates // 50)) / 60
-        result.write_text(json.dumps({"updates": updates, "minutes": round(minutes, 1)}))
+        plan = folder / "updates.json"
+        if not plan.exists():
+            shutil.rmtree(folder / "trial", ignore_errors=True)
+            train(options, name, folder / "trial", TRIAL, TRIAL // 2)
+            seconds = seconds_per_update(folder / "trial.log")[-1]  # of the second half
+            write_atomically(plan, json.dumps(max(1, round(60 * options.minutes / seconds))))
+        shutil.rmtree(folder / "trial", ignore_errors=True)
+        updates = json.loads(plan.read_text())
+        minutes = updates * train(options, name, folder / "train", updates, max(1, updates // 50)) / 60
+        write_atomically(result, json.dumps({"updates": updates, "minutes": round(minutes, 1)}))
     command(
         "lansar-eval",
         f"--policy.path={folder / 'train/checkpoints/last/pretrained_model'}",

@@ -137,7 +137,7 @@ def main() -> None:
         files = sorted(folder.glob("episode_*.npz"))
         # runs of 50 frames from everywhere: neighbours must stay neighbours
         runs = [files[start : start + 50] for start in range(0, len(files), 50)]
-        step = max(1, len(runs) * 50 // options.count)
+        step = -(-len(runs) * 50 // options.count)
         chosen = [file for run in runs[::step] for file in run]
         for camera in tqdm(CAMERAS, desc="cameras"):
             pictures = np.stack([np.load(file)[f"rgb_{camera}"] for file in chosen])

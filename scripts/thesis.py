@@ -131,9 +131,9 @@ class Thesis:
         return self.started + self.seconds - time.time()
 
     def record(self) -> None:
-        """Demonstrations, converted; unless they are there already."""
+        """Demonstrations, converted, unless --dataset has them; what is there already is not made again."""
         o, data = self.options, self.out / "data"
-        if (self.dataset / "meta/info.json").exists():
+        if o.dataset and (self.dataset / "meta/info.json").exists():
             return
         workers = max(1, int(RECORDERS * o.workers))
         speed = FRAMES_PER_CORE["pictures" if o.pictures else "state"]

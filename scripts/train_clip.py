@@ -93,6 +93,7 @@ class Options:
     # Pictures of each camera in an update.
     batch_size: int = 96
     learning_rate: float = 1e-3
+    # Of `train`; recordings and what `judge` fits on are always the same.
     seed: int = 0
     # Where `train` and `judge` compute.
     device: str = "cpu"

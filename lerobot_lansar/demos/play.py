@@ -23,15 +23,15 @@ _PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each
 _LATEST = 10  # frames after the fulfilment in which a window must end
 
 
-def group_name(task: Task) -> str:
-    """The group of tasks that a weight is given to: its kind, for lifting and placing also where."""
+def kind_name(task: Task) -> str:
+    """The kind of task that a weight is given to; for lifting and placing with where."""
     if task.kind == "place_block":
         return task.name
     return f"lift_{task.place}" if task.kind == "lift_block" else task.kind
 
 
-GROUPS = tuple(dict.fromkeys(group_name(task) for task in TASKS.values()))
-"""The groups of tasks among which play chooses."""
+KINDS = tuple(dict.fromkeys(kind_name(task) for task in TASKS.values()))
+"""The kinds of tasks among which play chooses."""
 
 
 def record_play(
@@ -56,7 +56,7 @@ def record_play(
         writer: Receives the frames.
         noise, variety: As for `demonstrator.demonstrate`.
         whole: The windows are whole subtasks instead of CALVIN's.
-        weights: Group of tasks (`GROUPS`) to how often it is chosen compared with a group that is not named.
+        weights: Kind of task (`KINDS`) to how often it is chosen compared with a kind that is not named.
 
     Returns:
         What was recorded: stretches between resets, and the windows with their tasks.
@@ -139,17 +139,17 @@ def stay(view: View) -> Iterator[Waypoint]:
 
 
 def choose_task(tasks: list[Task], before: str | None, rng: np.random.Generator, weights: Mapping[str, float]) -> str:
-    """The name of one task: groups are as likely as their weights say, and none comes twice in a row if others can."""
-    groups: dict[tuple[str, str], list[str]] = {}
+    """The name of one task: kinds are as likely as their weights say, and none comes twice in a row if others can."""
+    kinds: dict[tuple[str, str], list[str]] = {}
     for task in sorted(tasks, key=_color_and_side):
         if task.name != before or len(tasks) == 1:
-            groups.setdefault((task.kind, task.place or ""), []).append(task.name)
-    names = sorted(groups)
-    likely = np.array([weights.get(group_name(TASKS[groups[name][0]]), 1.0) for name in names])
+            kinds.setdefault((task.kind, task.place or ""), []).append(task.name)
+    names = sorted(kinds)
+    likely = np.array([weights.get(kind_name(TASKS[kinds[name][0]]), 1.0) for name in names])
     if not likely.any():  # nothing else can be done
         likely = np.ones(len(names))
-    group = groups[names[rng.choice(len(names), p=likely / likely.sum())]]
-    return str(rng.choice(group))
+    kind = kinds[names[rng.choice(len(names), p=likely / likely.sum())]]
+    return str(rng.choice(kind))
 
 
 def _color_and_side(task: Task) -> tuple[int, str]:

@@ -10,7 +10,7 @@ from ..desk import SCENES, DeskError
 from ..jobs.executors import check_executor
 from ..jobs.work import SlurmConfig
 from ..pictures import check_size
-from .play import GROUPS
+from .play import KINDS
 from .skills import SKILLS
 
 _SHORTEST = 0.1 / 60
@@ -96,7 +96,7 @@ class RecordConfig:
     validation_hours: float | None = None
     # Length of a session of play, chains or takeovers; sessions are divided among the workers.
     session_minutes: float = 2.0
-    # How often play, chains and takeovers choose a group of tasks compared with the others, which have 1:
+    # How often play, chains and takeovers choose a kind of task compared with the others, which have 1:
     # '{lift_slider: 3, place_in_slider: 2}'; 0 leaves it out where anything else can be done.
     weights: dict[str, float] = field(default_factory=dict)
     # Decides all random choices: the same seed gives the same data for any number of workers.
@@ -183,11 +183,11 @@ class RecordConfig:
         for name in _SESSION_OPTIONS if self.mode == "windows" else _EPISODE_OPTIONS:
             if getattr(self, name) != self._usual(name):
                 raise DeskError(f"--{name} has no effect with --mode={self.mode}: leave it out, or choose another mode")
-        for group, weight in self.weights.items():
-            if group not in GROUPS:
-                raise DeskError(f"--weights: there is no group {group!r} of tasks; choose among: {', '.join(GROUPS)}")
+        for kind, weight in self.weights.items():
+            if kind not in KINDS:
+                raise DeskError(f"--weights: there is no kind of task {kind!r}; choose among: {', '.join(KINDS)}")
             if not 0 <= weight <= 100:
-                raise DeskError(f"--weights: a weight lies between 0 and 100, got {weight} for {group}")
+                raise DeskError(f"--weights: a weight lies between 0 and 100, got {weight} for {kind}")
         if self.mode == "windows" and self.weights:
             raise DeskError(
                 "--weights goes with --mode=play, chains or takeovers; with --mode=windows name a task twice in --tasks"

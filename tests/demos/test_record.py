@@ -416,7 +416,7 @@ CHAINS = {"mode": "chains", "tasks": list(SKILLS)}
         ({"validation_episodes": 5, **CHAINS}, "--validation_episodes has no effect with --mode=chains"),
         (
             {"weights": {"lift": 2.0}, **CHAINS},
-            "--weights: there is no group 'lift' of tasks; choose among",
+            "--weights: there is no kind of task 'lift'; choose among",
         ),
         ({"weights": {"lift_slider": -1.0}, **CHAINS}, "--weights: a weight lies between 0 and 100, got -1.0"),
         ({"weights": {"lift_slider": 2.0}}, "--weights goes with --mode=play, chains or takeovers"),
