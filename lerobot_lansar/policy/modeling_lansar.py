@@ -155,6 +155,10 @@ class LanSARPolicy(PreTrainedPolicy):
                     module.eval()
         return self
 
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """What `--peft.method_type` adapts unless `--peft.target_modules` says otherwise."""
+        return {"target_modules": "all-linear", "modules_to_save": []}
+
     def reset(self) -> None:
         """Clears all histories; LeRobot calls this before each batch of episodes."""
         self._histories: list[History] = []

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from huggingface_hub import ModelCard
+from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import nn
 
 import lerobot_lansar.clip.commands as commands_module
@@ -389,6 +390,8 @@ def test_under_adapters_the_base_policy_stays_as_it_was_saved():
     policy.config.use_peft = True  # LeRobot's mark of a policy whose adapters alone are saved
     policy.train()
     assert not any(norm.training for norm in norms)
+    assert policy._get_default_peft_targets()["target_modules"] == "all-linear", "LeRobot asks for it by this name"
+    assert "_get_default_peft_targets" in vars(PreTrainedPolicy)
 
 
 def test_a_trained_image_encoder_begins_as_clips_and_gets_gradients_from_every_step():
