@@ -45,8 +45,10 @@ def verify(config: VerifyConfig) -> str:
     Raises:
         FileNotFoundError: Files of one of them are missing.
         Mismatch: They differ; the message says where.
-        ValueError: The source is defective.
+        ValueError: The source is defective, or an option wrong.
     """
+    if config.workers < 1:
+        raise ValueError(f"--workers={config.workers}: expected 1 or more")
     folder = find_dataset(config.repo_id, config.dataset_dir)
     dataset = Dataset(folder, config.root)
     told = check_claims(dataset)

@@ -32,6 +32,7 @@ from matplotlib.figure import Figure  # not pyplot: a bare figure is drawn by Ag
 from matplotlib.image import AxesImage
 
 from .command import run_command
+from .envs.configuration_calvin import CalvinEnvConfig
 from .evaluation.loading import load_policy
 from .policy.modeling_lansar import LanSARPolicy
 from .policy.network import recorded_attention
@@ -155,8 +156,10 @@ def check_options(config: AttentionConfig) -> None:
     """Checks the policy and the steps.
 
     Raises:
-        ValueError: The policy is no trained LanSAR, or a step is negative.
+        ValueError: The policy is no trained LanSAR, the environment is not the desk, or a step is negative.
     """
+    if not isinstance(config.env, CalvinEnvConfig):
+        raise ValueError(f"lansar-attention runs the policy on the desk, --env.type=calvin; got {config.env.type}")
     if config.policy is None or config.policy.type != "lansar" or not config.policy.pretrained_path:
         found = "none" if config.policy is None else f"an untrained policy of type {config.policy.type}"
         raise ValueError(f"lansar-attention needs a LanSAR checkpoint, --policy.path=DIR; got {found}")
@@ -177,8 +180,8 @@ def observe(config: AttentionConfig) -> Attention:
     env = next(iter(next(iter(envs.values())).values()))
     assert config.policy is not None
     policy, processors = load_policy(config.policy, config.env)
-    assert isinstance(policy, LanSARPolicy)
-    recorder = Recorder(policy, env)
+    lansar = policy if isinstance(policy, LanSARPolicy) else policy.get_base_model()  # under LoRA's adapters
+    recorder = Recorder(lansar, env)
     try:
         with torch.no_grad(), recorder.recording():
             rollout(

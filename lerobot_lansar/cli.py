@@ -5,6 +5,7 @@ becomes LeRobot's command.
 """
 
 import os
+import re
 import sys
 import sysconfig
 from pathlib import Path
@@ -46,10 +47,13 @@ def translate(command: str, arguments: list[str]) -> list[str]:
     translated = []
     for position, argument in enumerate(arguments):
         key, equals, value = argument.partition("=")
+        if not re.fullmatch(r"[A-Za-z_][\w.]*", key):  # such as JSON that holds a "="
+            equals = ""
         follows_option = (
             position > 0 and arguments[position - 1].startswith("--") and "=" not in arguments[position - 1]
         )
-        if argument.startswith("-") or (follows_option and not equals):
+        positional = command == "find-cameras" and not equals  # LeRobot's only one
+        if argument.startswith("-") or (follows_option and not equals) or positional:
             translated.append(argument)
         elif not equals:
             raise CommandError(f"{argument!r} is neither key=value nor an option; see `lerobot {command} --help`")

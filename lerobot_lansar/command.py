@@ -5,7 +5,9 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+import yaml
 from draccus.utils import DraccusException
+from huggingface_hub.errors import HFValidationError
 
 
 class CommandError(Exception):
@@ -27,14 +29,26 @@ def run_command(name: str, function: Callable[[], int | None], resumable: bool =
         return function() or 0
     except subprocess.CalledProcessError as error:
         message = _describe(error)
-    except (OSError, ValueError, CommandError, DraccusException) as error:
-        message = str(error)
+    except (OSError, ValueError, CommandError, DraccusException, yaml.YAMLError) as error:
+        message = _explain(error)
     except KeyboardInterrupt:
         hint = "; the same command goes on where it stopped" if resumable else ""
         print(f"{name}: interrupted{hint}", file=sys.stderr)
         return 130
     print(f"{name}: error: {message}", file=sys.stderr)
     return 2
+
+
+def _explain(error: Exception) -> str:
+    """The message of an error; draccus hides behind its own what an options' class or a file's reader said."""
+    if isinstance(error, yaml.YAMLError):
+        return f"an option is not valid YAML (a list is written '[a,b]', in quotes): {' '.join(str(error).split())}"
+    cause = error.__cause__ if isinstance(error, DraccusException) else None
+    if cause is not None and not isinstance(cause, ValueError):
+        return f"{error}: {' '.join(str(cause).split())}"
+    said = cause or error
+    hub = isinstance(said, HFValidationError)
+    return f"there is no such folder, nor can it be on the hub: {said}" if hub else str(said)
 
 
 def _describe(error: subprocess.CalledProcessError) -> str:

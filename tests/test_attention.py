@@ -79,8 +79,13 @@ def test_a_rollout_leaves_weights_plots_and_video(checkpoint, tmp_path, monkeypa
         assert (tmp_path / "out" / name).stat().st_size > 1000
 
 
-def test_other_policies_are_refused(monkeypatch, capsys):
-    code = run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", "--env.type=calvin")
-    assert code == 2
-    message = "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act"
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ("calvin", "needs a LanSAR checkpoint, --policy.path=DIR; got an untrained policy of type act"),
+        ("pusht", "runs the policy on the desk, --env.type=calvin; got pusht"),
+    ],
+)
+def test_other_policies_and_environments_are_refused(monkeypatch, capsys, env, message):
+    assert run(monkeypatch, "--policy.type=act", "--policy.push_to_hub=false", f"--env.type={env}") == 2
     assert message in capsys.readouterr().err

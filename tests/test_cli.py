@@ -31,6 +31,8 @@ from lerobot_lansar import cli
             ["--repo_id", "me/desk", "--new_root=a=b"],
         ),
         ("train", ["-h"], ["-h"]),
+        ("find-cameras", ["opencv"], ["opencv"]),
+        ("train", ["--rename_map", '{"a": "b=c"}'], ["--rename_map", '{"a": "b=c"}']),
     ],
 )
 def test_options_are_rewritten_in_lerobots_style(command, arguments, expected):

@@ -3,12 +3,14 @@
 import importlib
 import subprocess
 import sys
-from dataclasses import is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from importlib.metadata import entry_points
 
+import draccus
 import pytest
 from draccus.utils import ParsingError
 from draccus.wrappers import docstring
+from huggingface_hub.utils import validate_repo_id
 
 from dataset_convert.embed import EmbedConfig
 from dataset_convert.options import ConvertConfig
@@ -73,6 +75,34 @@ def test_an_error_that_the_user_can_fix_is_one_message_and_exit_code_2(capsys, k
 
     assert run_command("lansar-test", function) == 2
     assert capsys.readouterr().err == "lansar-test: error: give --this instead\n"
+
+
+@dataclass
+class Options:
+    path: str = "here"
+    numbers: list[int] = field(default_factory=list)
+
+    def __post_init__(self):
+        if self.path == "nowhere":
+            raise ValueError("--path=nowhere: give another")
+        validate_repo_id(self.path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--path=nowhere", "error: --path=nowhere: give another\n"),
+        ("--path=a/b/c", "error: there is no such folder, nor can it be on the hub: Repo id must be in the form"),
+        ("--numbers=[1", "error: an option is not valid YAML (a list is written '[a,b]', in quotes): while parsing"),
+        ("--config_path=bad.yaml", 'while parsing a flow sequence in "bad.yaml", line 1, column 10'),
+    ],
+)
+def test_the_reason_that_draccus_hides_is_told(tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.yaml").write_text("numbers: [1")
+    monkeypatch.setattr(sys, "argv", ["lansar-test", options])
+    assert run_command("lansar-test", lambda: print(draccus.parse(Options))) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_a_mistake_of_ours_keeps_its_traceback():

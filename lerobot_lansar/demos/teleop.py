@@ -132,8 +132,8 @@ class Session:
         elif key == "backspace":
             self.begin()
         elif key == "enter":
-            if self.recording and self.fulfilled and self.config.output_dir is not None:
-                self._keep(self.config.output_dir)
+            if self.recording:
+                self._end()
             self.recording = not self.recording and self.config.output_dir is not None
             self.mark()
 
@@ -153,6 +153,16 @@ class Session:
         now = self.desk.completed_tasks(self._start)
         self.fulfilled = {task: self.fulfilled.get(task, self.steps) for task in sorted(now)}
         return self.obs
+
+    def _end(self) -> None:
+        """Keeps the demonstration under way if a task is fulfilled, with one more frame, which shows it."""
+        if self.fulfilled:
+            self.step()
+        if self.fulfilled:
+            assert self.config.output_dir is not None
+            self._keep(self.config.output_dir)
+        else:
+            print("the demonstration was dropped: no task is fulfilled", file=sys.stderr)
 
     def _keep(self, output: Path) -> None:
         """Writes the recorded frames as one demonstration: of `--task` if it is fulfilled, else of the latest task."""
@@ -183,6 +193,8 @@ class Session:
         output = self.config.output_dir
         if output is None:
             return
+        if self.recording:
+            print("the demonstration under way was dropped: ENTER keeps one", file=sys.stderr)
         if self.kept:
             details: dict[str, str | int] = {key: str(value) for key, value in asdict(self.config).items()}
             details |= {"assets_used": self.desk.assets, "control_hz": CONTROL_HZ}

@@ -134,8 +134,8 @@ class DatasetSource:
         scene = self._only(rows, "calvin.scene", number)
         return Recording(
             name=f"episode {number}",
-            scene="" if scene < 0 else self._scene_names[scene],
-            task="" if task < 0 else self._task_names[task],
+            scene=self._scene_names[scene] if 0 <= scene < len(self._scene_names) else "",
+            task=self._task_names[task] if 0 <= task < len(self._task_names) else "",
             sentence=str(self._meta.tasks.index[self._only(rows, "task_index", number)]),
             robot_obs=vectors[_STATE],
             scene_obs=vectors[_SCENE_STATE][:, :24],

@@ -70,9 +70,10 @@ def _pairs(losses: dict[int, float]) -> list[list[Any]]:
 def _from_folder(folder: Path) -> tuple[str, Losses]:
     """The first source that tells anything, and what it tells."""
     checkpoints = folder / "checkpoints"
-    newest = sorted(checkpoints.glob(f"[0-9]*/pretrained_model/{LOSSES_FILE}"), key=lambda p: int(p.parts[-3]))
-    last = checkpoints / "last" / "pretrained_model" / LOSSES_FILE
-    for path in (folder / LOSSES_FILE, last, *reversed(newest)):
+    numbered = [p for p in checkpoints.glob(f"*/pretrained_model/{LOSSES_FILE}") if p.parts[-3].isdecimal()]
+    newest = sorted(numbered, key=lambda p: int(p.parts[-3]), reverse=True)
+    checkpoint = Path("pretrained_model", LOSSES_FILE)
+    for path in (folder / LOSSES_FILE, folder / checkpoint, checkpoints / "last" / checkpoint, *newest):
         if path.is_file():
             return path.relative_to(folder).as_posix(), _from_json(path)
     runs = sorted(folder.glob("wandb/*run-*/run-*.wandb"), key=lambda path: path.parent.name.removeprefix("offline-"))

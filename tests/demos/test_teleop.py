@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dataset_convert.calvin import CalvinSplit
-from lerobot_lansar.calvin import relative_action
+from lerobot_lansar.calvin import CAMERAS, relative_action
 from lerobot_lansar.demos import teleop
 from lerobot_lansar.desk import Desk, DeskError, SimulationError
 
@@ -53,7 +53,23 @@ def test_enter_keeps_demonstrations_that_fulfil_a_task(tmp_path):
         teleop.teleoperate(config)
 
 
-def test_a_task_that_was_undone_is_not_kept(tmp_path):
+def test_a_demonstrations_last_frame_shows_its_task_fulfilled(tmp_path):
+    session = teleop.Session(teleop.TeleopConfig(output_dir=tmp_path), Desk("D", None, CAMERAS))
+    session.press("enter")
+    held = [key for key, steps in teleop.parse_keys("a8 w6 f7 wait4 r4") for _ in range(steps)]
+    while not session.fulfilled:
+        key = held.pop(0)
+        session.step(() if key == "wait" else (key,))
+    session.press("enter")
+    session.finish()
+    split = CalvinSplit(tmp_path, "training")
+    (window,) = split.windows
+    led = split.read(range(window.start, window.end), ["scene_obs"])["scene_obs"][:, 5]
+    assert led[-1] == 1
+    assert not led[:-1].any()
+
+
+def test_a_task_that_was_undone_is_not_kept(tmp_path, capsys):
     config = teleop.TeleopConfig(
         keys="enter a8 w6 f7 wait4 r4 f5 wait5 r4 enter",
         output_dir=tmp_path / "mine",
@@ -62,6 +78,7 @@ def test_a_task_that_was_undone_is_not_kept(tmp_path):
     session = teleop.teleoperate(config)
     assert not session.fulfilled
     assert not session.kept
+    assert "the demonstration was dropped: no task is fulfilled" in capsys.readouterr().err
     assert not (tmp_path / "mine" / "training").exists()
 
 

@@ -54,8 +54,13 @@ def test_losses_that_lansar_wrote_come_first(tmp_path):
     assert found["held_out"] == [[20, 0.7], [30, 0.6]]
     checkpoint(tmp_path, "last", losses__json=kept((1, 2, 3)))
     assert read_training(tmp_path)["training"] == [[1, 2.0]], "last is the newest, whatever its number"
-    one = tmp_path / "checkpoints/000100/pretrained_model"
-    assert read_training(one)["training"] == [[10, 0.9]], "one checkpoint may be named"
+    checkpoint(tmp_path, "000300_copy", losses__json=kept((5, 0.3)))
+    for one in ("checkpoints/000100/pretrained_model", "checkpoints/000100"):
+        assert read_training(tmp_path / one)["training"] == [[10, 0.9]], "one checkpoint may be named"
+    (tmp_path / "checkpoints/last/pretrained_model/losses.json").unlink()
+    assert read_training(tmp_path)["source"] == "checkpoints/000200/pretrained_model/losses.json", (
+        "the copy has no number"
+    )
 
 
 def test_losses_that_are_not_finite_are_kept_as_unknown(tmp_path):
