@@ -66,6 +66,9 @@ def original_assets() -> Path:
 SBATCH = """#!/usr/bin/env python3
 import os, re, subprocess, sys
 script = open(sys.argv[-1]).read()
+if "merge_stats" in script:  # datatrove's own summary, which nobody reads
+    print("Submitted batch job 42")
+    sys.exit()
 array = re.search(r"--array=(\\d+)-(\\d+)", script)
 for index in range(int(array[1]), int(array[2]) + 1):
     environment = {

@@ -44,7 +44,7 @@ def run(work):
 def dataset(run, work):
     """Demonstrations on all four desks with pictures, converted with videos and CLIP embeddings."""
     tasks = "--tasks=[turn_on_led,lift_red_block_table]"
-    run("lansar-record", "--output_dir=desk", tasks, "--scene=[A,B,C,D]", "--episodes=8")
+    run("lansar-record", "--output_dir=desk", tasks, "--scene=[A,B,C,D]", "--episodes=8", "--validation_episodes=4")
     run(
         "lansar-convert",
         "--root=desk",
@@ -118,6 +118,8 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
     )
     decoded = list((work / "data/.cache/huggingface").glob("lansar_frames_pictures/*/static.npy"))
     run("lerobot-train", f"--config_path={tuned}/train_config.json", "--resume=true", "--steps=3")
+    state = load_file(work / "out/encoder/checkpoints/last/training_state/optimizer_state.safetensors")
+    assert {int(value) for key, value in state.items() if key.endswith("/step")} == {3}, "resumed, not begun again"
 
     (file,) = decoded
     pictures, clip = np.load(file, mmap_mode="r"), Clip(ClipConfig("lansar-desk", ""))
@@ -155,17 +157,6 @@ def test_lansar_trains_its_image_encoder_resumes_and_evaluates(run, work, datase
         "--output_dir=eval_encoder",
     )
     assert len(successes(work, "eval_encoder")[0]) == 2
-    printed = run(
-        "lansar-eval",
-        f"--policy.path={tuned}",
-        *EVALUATION,
-        "--env.cameras=[]",
-        "--chains=1",
-        "--workers=1",
-        "--output_dir=eval_blind",
-        fails=True,
-    )
-    assert "Evaluate with --env.cameras" in printed
 
 
 def successes(work, folder):
@@ -187,7 +178,6 @@ def test_without_the_scenes_state_lansar_knows_the_blocks_from_pictures(run, wor
         "--steps=1",
         "--output_dir=out/b",
     ]
-    assert "environment_state is missing" in run(*train, fails=True)
     run(*train, "--policy.use_spatial_context=false")
     evaluate = ["lerobot-eval", "--policy.path=out/b/checkpoints/last/pretrained_model", *EVALUATION]
     evaluate += ["--env.task=turn_on_led", "--eval.n_episodes=2", "--eval.batch_size=2"]
@@ -198,6 +188,8 @@ def test_without_the_scenes_state_lansar_knows_the_blocks_from_pictures(run, wor
         lines = [json.loads(line) for line in (work / folder / "episodes.jsonl").read_text().splitlines()]
         ends.append({line["seed"]: line["end"] for line in lines})
     assert ends[0] == ends[1]
+    assert sorted(ends[0]) == [1000, 1001]
+    assert ends[0][1000] != ends[0][1001]
 
 
 def test_the_converted_recording_equals_what_was_recorded(run, dataset):
@@ -263,22 +255,6 @@ def test_a_chain_is_evaluated_and_reported(run, work, lansar):
     report = json.loads((work / "eval_chain" / "report.json").read_text())
     assert report["tables"][0]["evaluations"][0]["average_length"] == 0
     assert list((work / "eval_chain").rglob("*.mp4"))
-
-
-def test_training_resumes_and_fine_tunes(run, work, dataset, lansar):
-    config = f"{lansar}/train_config.json"
-    run("lerobot-train", f"--config_path={config}", "--resume=true", "--steps=4")
-    assert (work / "out/lansar/checkpoints/000004/pretrained_model/model.safetensors").is_file()
-    run(
-        "lerobot-train",
-        f"--policy.path={lansar}",
-        "--policy.push_to_hub=false",
-        *dataset,
-        *TRAINING,
-        "--steps=2",
-        "--output_dir=out/tuned",
-    )
-    assert (work / "out/tuned/checkpoints/last/pretrained_model/model.safetensors").is_file()
 
 
 def test_diffusion_trains_on_one_camera_of_the_dataset_and_runs_on_the_desk(run, work, dataset):
@@ -359,18 +335,3 @@ def test_depth_and_cameras_of_one_size_from_the_recording_to_the_evaluation(run,
             assert learned[key].dtype == seen[key].dtype
             assert learned[key].shape == seen[key][0].shape
             assert (learned[key] - seen[key][0]).abs().mean() < error
-
-
-def test_unusable_requests_are_answered_clearly(run, dataset):
-    assert "'juggle' is unknown" in run(
-        "lerobot-eval",
-        "--policy.type=act",
-        "--policy.device=cpu",
-        "--env.type=calvin",
-        "--env.task=juggle",
-        "--output_dir=nowhere",
-        fails=True,
-    )
-    printed = run("lansar-convert", "--root=elsewhere", "--repo_id=me/x", "--output_dir=x", fails=True)
-    assert "elsewhere" in printed
-    assert "Traceback" not in printed

@@ -169,11 +169,23 @@ DEFECTS = {
 }
 
 
-@pytest.mark.parametrize("frame", [100, 112, 113, 123], ids="frame {}".format)
-@pytest.mark.parametrize("defect", DEFECTS)
-@pytest.mark.parametrize("mode", ["windows", "play"])
+WHERE = {
+    ("windows", 100): ("a missing frame", "no picture", "a picture of a wrong size"),
+    ("windows", 112): tuple(defect for defect in DEFECTS if "picture" not in defect),
+    ("windows", 113): tuple(DEFECTS),
+    ("windows", 123): ("a truncated frame", "a wrong relative action"),
+    ("play", 100): ("a missing frame",),
+    ("play", 112): ("a missing frame",),
+    ("play", 113): tuple(DEFECTS),
+}
+"""Mode of the conversion and frame to the defects that are tried: all inside an episode, some at frames that are read
+beforehand, as the first and the last of a lift."""
+
+
+@pytest.mark.parametrize(
+    ("mode", "frame", "defect"), [(*at, defect) for at, defects in WHERE.items() for defect in defects]
+)
 def test_a_defective_episode_stops_the_conversion_or_is_left_out(tmp_path, monkeypatch, capsys, defect, mode, frame):
-    """Whichever of its frames it is: others are read before, the first and the last of a lift among them."""
     monkeypatch.setattr("dataset_convert.shards.BATCH_FRAMES", 5)  # it is found after a part was written
     if mode == "windows":  # good and bad ones in one file; in play a file each
         monkeypatch.setattr(plan, "cut_into_shards", lambda lengths, max_frames: [(0, len(lengths))])

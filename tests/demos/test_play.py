@@ -108,14 +108,14 @@ def test_weights_decide_how_often_a_group_of_tasks_is_chosen():
     assert choose_task([TASKS["turn_on_led"]], None, rng, weights) == "turn_on_led"  # nothing else can be done
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_a_sampled_start_of_a_task_is_feasible_in_play(task):
+def test_a_sampled_start_of_a_task_is_feasible_in_play():
+    feasible = Counter()
     with Desk("D", cameras=()) as desk:
-        feasible = 0
-        for seed in range(4):
-            obs = desk.reset(*sample_start(desk, task, np.random.default_rng(seed)))
-            feasible += TASKS[task] in feasible_tasks(desk.scene, desk.snapshot(), obs)
-    assert feasible >= 3
+        for task in TASKS:
+            for seed in range(4):
+                obs = desk.reset(*sample_start(desk, task, np.random.default_rng(seed)))
+                feasible[task] += TASKS[task] in feasible_tasks(desk.scene, desk.snapshot(), obs)
+    assert {task: count for task, count in feasible.items() if count < 3} == {}
 
 
 def test_after_unstacking_the_benchmarks_other_commands_are_feasible_with_the_block_in_the_hand():

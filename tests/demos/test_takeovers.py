@@ -158,12 +158,10 @@ def test_the_policy_acts_first_and_the_demonstrator_finishes(recording):
 
 
 def test_workers_batches_and_kills_change_nothing(recording, lansar, tmp_path):
-    two = record(options(tmp_path / "two", lansar, workers=2, batch_size=1))
-    assert content(two) == content(recording)
     target = tmp_path / "killed"
     arguments = [f"--output_dir={target}", "--mode=takeovers", f"--policy.path={lansar}", "--env.control_mode=abs"]
     arguments += [f"--hours={0.75 * MINUTE}", f"--validation_hours={0.15 * MINUTE}", "--session_minutes=0.25"]
-    arguments += ["--patience=0.3", "--batch_size=1", "--cameras=[]", "--seed=3"]
+    arguments += ["--patience=0.3", "--batch_size=1", "--workers=2", "--cameras=[]", "--seed=3"]
     process = subprocess.Popen(
         [sys.executable, "-m", "lerobot_lansar.demos.record", *arguments],
         stderr=subprocess.DEVNULL,
