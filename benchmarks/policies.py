@@ -24,6 +24,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 
 import draccus
 from ablations import command
@@ -64,11 +65,6 @@ POLICIES = {
         [f"--config_path={CONFIGS / 'lansar.yaml'}"],
         ["--env.control_mode=abs", "--env.cameras=[]"],
     ),
-    "no_space": Policy(
-        "embedded",
-        [f"--config_path={CONFIGS / 'lansar.yaml'}", "--policy.use_images=true", "--policy.use_spatial_context=false"],
-        ["--env.control_mode=abs", "--env.scene_state=false"],
-    ),
     "mcil": Policy("told", [f"--config_path={CONFIGS / 'peers/mcil_small.yaml'}"], TOLD),
     "hulc": Policy(
         "relative",
@@ -81,6 +77,11 @@ POLICIES = {
         ["--env.scene_state=false"],
         ("--policy.decay_steps",),
         ("--policy.warmup_steps",),
+    ),
+    "no_space": Policy(
+        "embedded",
+        [f"--config_path={CONFIGS / 'lansar.yaml'}", "--policy.use_images=true", "--policy.use_spatial_context=false"],
+        ["--env.control_mode=abs", "--env.scene_state=false"],
     ),
     "act": Policy(
         "told",
@@ -120,6 +121,7 @@ CONVERSIONS = {
     "told": ["--images=png", f"--image_size={SIZE}", "--scene_state=false", "--task_in_state=true", "--action=abs"],
     "embedded": ["--images=none", "--embed=true", "--clip.model=lansar-desk", "--clip.pretrained=v1", "--action=abs"],
 }
+LOCKS = {name: Lock() for name in CONVERSIONS}
 
 
 @dataclass
@@ -141,9 +143,9 @@ class Options:
 
 
 def record(options: Options) -> None:
-    """The demonstrations, as CALVIN's files and as the datasets that the policies need."""
+    """The demonstrations, as CALVIN's files."""
     options.data.mkdir(parents=True, exist_ok=True)
-    log, chains = options.data / "log.txt", options.data / "chains"
+    chains = options.data / "chains"
     if not (chains / "validation").exists():  # which appears last
         command(
             "lansar-record",
@@ -154,18 +156,21 @@ def record(options: Options) -> None:
             "--seed=0",
             f"--workers={options.workers}",
             f"--output_dir={chains}",
-            log=log,
+            log=options.data / "record.log",
         )
-    for name in {POLICIES[policy].data for policy in options.policies}:
+
+
+def convert(options: Options, name: str) -> None:
+    """One of the datasets, by one core while others train; a second caller waits, and finds it there."""
+    with LOCKS[name]:
         command(  # does nothing if it is done, and goes on if it was interrupted
             "lansar-convert",
-            f"--root={chains}",
+            f"--root={options.data / 'chains'}",
             "--split=training",
             f"--repo_id=lansar/{name}",
             f"--output_dir={options.data / name}",
-            f"--workers={options.workers}",
             *CONVERSIONS[name],
-            log=log,
+            log=options.data / f"{name}.log",
         )
 
 
@@ -217,11 +222,12 @@ def attempt(options: Options, name: str) -> str | None:
 
 
 def measure(options: Options, name: str) -> None:
-    """One policy: how fast it trains, its training, its evaluation."""
+    """One policy: its data, how fast it trains, its training, its evaluation."""
     folder = options.output_dir / name
     folder.mkdir(parents=True, exist_ok=True)
     result = folder / "train.json"
     if not result.exists():
+        convert(options, POLICIES[name].data)
         plan = folder / "updates.json"
         if not plan.exists():
             shutil.rmtree(folder / "trial", ignore_errors=True)
