@@ -91,7 +91,8 @@ class CalvinEnv(gym.Env):
             is `perturbation_scale` times its size (Eq 4.9 of the thesis; its experiments are 50 and 5, 25 and 2.5,
             5 and 0.5). The draws depend on the episode's seed.
         perturbation_scale: Gamma of that equation.
-        render_fps: How many new pictures `render` draws per second; in between it returns the last one again.
+        render_fps: How many new pictures `render` draws per second; in between it returns the last one again, but for
+            an episode's end, which it shows.
         depth: Whether observations hold the cameras' depth too.
         depth_unit: `"m"` or `"mm"`.
         camera_poses: Whether observations hold the cameras' poses and intrinsics too.
@@ -256,7 +257,8 @@ class CalvinEnv(gym.Env):
             raise DeskError("reset the environment before rendering it")
         if self._reason is not None and self._picture is not None:
             return self._picture[1]
-        if self._picture is None or self._steps - self._picture[0] >= self._redraw_every:
+        every = self._redraw_every if self._commands else 1  # the last picture shows how the episode ended
+        if self._picture is None or self._steps - self._picture[0] >= every:
             self._picture = (self._steps, self._desk.render("static", self._render_size))
         return self._picture[1]
 

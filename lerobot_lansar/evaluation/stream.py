@@ -80,7 +80,7 @@ class EpisodeStream(gym.Wrapper):
             observation, info = self._current
             return observation, 0.0, True, False, info
         observation, reward, terminated, _, info = self.env.step(action)
-        self._film()
+        self._film(at_the_end=terminated)
         self._current = observation, info
         if terminated:
             self._save()
@@ -101,10 +101,10 @@ class EpisodeStream(gym.Wrapper):
         self._film()
         return started
 
-    def _film(self) -> None:
-        """Keeps a picture now and then, if the episode is to be shown."""
+    def _film(self, at_the_end: bool = False) -> None:
+        """Keeps a picture now and then and of the end, if the episode is to be shown."""
         if self.episode is not None and self.episode.video is not None:
-            if self._steps % self._film_every == 0:
+            if at_the_end or self._steps % self._film_every == 0:
                 self._frames.append(self.env.render())  # type: ignore[arg-type]
             self._steps += 1
 

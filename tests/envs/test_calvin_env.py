@@ -357,14 +357,17 @@ def test_a_sentence_is_drawn_without_changing_the_start():
 
 
 def test_pictures_are_drawn_at_render_fps():
-    env = CalvinEnv("open_drawer", cameras=(), render_fps=10)
+    env = CalvinEnv("open_drawer", cameras=(), render_fps=10, steps_per_command=5)
     env.reset(seed=0)
     pictures = [env.render()]
-    for _ in range(4):
+    for _ in range(5):
         env.step([1, 0, 0, 0, 0, 0, 1])
         pictures.append(env.render())
     assert pictures[0].shape == (200, 200, 3)
-    assert [p is pictures[0] for p in pictures] == [True, True, True, False, False]
+    assert [p is pictures[0] for p in pictures[:3]] == [True] * 3
+    assert pictures[4] is pictures[3] is not pictures[0]
+    assert (pictures[5] != pictures[3]).any(), "the last one shows how the episode ended"
+    assert env.render() is pictures[5]
     env.close()
 
 

@@ -101,4 +101,6 @@ def test_chosen_episodes_are_filmed(tmp_path):
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.average_rate) == (200, 10)
-        assert len(list(container.decode(stream))) == 3, "of 9 pictures at 30 Hz, the first and every third after it"
+        assert len(list(container.decode(stream))) == 4, (
+            "of 9 pictures at 30 Hz, the first, every third after it and the last"
+        )
