@@ -9,17 +9,15 @@ from ..calvin import CHAIN_LENGTH, COLORS, GRIPPER_ACTION, STEPS_PER_COMMAND, SW
 from ..desk import Desk, SimulationError, completed_tasks, is_fulfilled
 from ..desk.desk import Observation
 from ..desk.oracle import DRAWER, PLANK, TABLE, Snapshot, has_stack
-from ..desk.scenes import DRAWER_TRAVEL, REACH, SWITCH_TRAVEL, TABLE_Z, Scene, can_be_pushed
+from ..desk.scenes import DRAWER_TRAVEL, REACH, SWITCH_TRAVEL, TABLE_Z, Scene, beside_door, can_be_pushed
 from ..desk.starts import sample_start
 from .calvin_folder import FrameWriter, Unit
 from .demonstrator import AFTERWARDS, Frame, carry_out
 from .moves import FALLEN, Style, View, Waypoint, lying
 from .skills import SKILLS
-from .skills.blocks import put_down
+from .skills.blocks import has_shelf_room, put_down
 
 NO_WEIGHTS: Mapping[str, float] = {}
-OPEN_DRAWER = 0.12
-"""How far (m) the drawer is open at least when something is to be brought into it: opening it is granted there."""
 _SHORTEST = 32  # frames in a window, unless its recording began later
 _PER_TASK = 2  # windows cut around a fulfilled task: CALVIN's windows show each frame 1.58 times
 _LATEST = 10  # frames after the fulfilment in which a window must end
@@ -185,9 +183,9 @@ def _is_feasible_holding(task: Task, held: str, view: View, snapshot: Snapshot) 
     """Whether a task can begin with a block in the hand."""
     match task.kind, task.place:
         case "place_block", "slider":
-            return True
+            return has_shelf_room(view)
         case "place_block", "drawer":
-            return view.drawer > OPEN_DRAWER
+            return view.drawer > 0.15
         case "stack_block", _:
             return any(_free_on_table(color, view, snapshot) for color in COLORS if color != held)
     return False
@@ -214,8 +212,8 @@ def _is_feasible(task: Task, view: View, snapshot: Snapshot) -> bool:
         case "unstack_block":
             return has_stack(snapshot)
         case "push_into_drawer":
-            untouched = [color for color in COLORS if snapshot.blocks[color].contacts == {TABLE}]
-            return view.drawer > OPEN_DRAWER and any(_free_on_table(color, view, snapshot) for color in untouched)
+            near = [color for color in COLORS if abs(view.block(color)[0] - view.scene.drawer_x) < 0.3]
+            return view.drawer > 0.15 and any(_free_on_table(color, view, snapshot) for color in near)
         case "rotate_block":
             return _free_on_table(str(task.color), view, snapshot)
         case "push_block":
@@ -228,28 +226,22 @@ def _is_feasible(task: Task, view: View, snapshot: Snapshot) -> bool:
 
 def _can_be_lifted(color: str, place: str, view: View, snapshot: Snapshot) -> bool:
     """Whether a block lies in that place, with nothing on it, and where a hand can take it."""
-    (y, z), contacts = view.block(color)[1:3], snapshot.blocks[color].contacts
-    if place == "table" and not (TABLE in contacts and _within_reach(view.block(color))):
-        return False
+    if place == "table":
+        return _free_on_table(color, view, snapshot)
+    (x, y, z), contacts = view.block(color)[:3], snapshot.blocks[color].contacts
     if any(view.lies_on(other, color) for other in COLORS if other != color):
         return False
-    if place == "table":
-        return True
     if place == "drawer":
         return DRAWER in contacts and bool(y < -0.215 and z < TABLE_Z - 0.05)
     flat = lying(view.block(color))[1]
-    return PLANK in contacts and bool(y < 0.125) and flat
+    return PLANK in contacts and bool(y < 0.125) and flat and beside_door(view.scene, view.slide, x)
 
 
 def _free_on_table(color: str, view: View, snapshot: Snapshot) -> bool:
-    """Whether a block touches nothing but the table, and perhaps the hand, and a hand can push and take it there."""
-    return snapshot.blocks[color].surfaces == {TABLE} and _within_reach(view.block(color))
-
-
-def _within_reach(pose: np.ndarray) -> bool:
-    """Whether a block lies on the table, where a hand can push and take it."""
-    x, y, z = pose[:3]
-    return bool(abs(z - TABLE_Z) < 0.03 and abs(x) < REACH and -0.19 < y < 0.0)
+    """Whether a block touches nothing but the table and lies where a hand can push and take it."""
+    x, y, z = view.block(color)[:3]
+    on_it = snapshot.blocks[color].contacts == {TABLE} and abs(z - TABLE_Z) < 0.03
+    return bool(on_it and abs(x) < REACH and -0.19 < y < 0.0)
 
 
 def whole_windows(snapshots: list[Snapshot], fulfilled: list[tuple[int, int, str]]) -> list[tuple[int, int, str]]:
