@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import yaml
 from draccus.utils import DraccusException
-from huggingface_hub.errors import HFValidationError
 
 
 class CommandError(Exception):
@@ -46,6 +45,8 @@ def _explain(error: Exception) -> str:
     cause = error.__cause__ if isinstance(error, DraccusException) else None
     if cause is not None and not isinstance(cause, ValueError):
         return f"{error}: {' '.join(str(cause).split())}"
+    from huggingface_hub.errors import HFValidationError  # late: it takes a tenth of a short command's start
+
     said = cause or error
     hub = isinstance(said, HFValidationError)
     return f"there is no such folder, nor can it be on the hub: {said}" if hub else str(said)

@@ -11,6 +11,7 @@ from dataset_convert.convert import convert
 from dataset_convert.options import ConvertConfig
 from lerobot_lansar.calvin import BLOCK_ORDER, block_columns, wrap_angle
 from lerobot_lansar.command import CommandError
+from lerobot_lansar.datasets import MANIFEST
 from lerobot_lansar.demos.record import record
 from lerobot_lansar.demos.record_config import RecordConfig
 from lerobot_lansar.desk import Desk, SimulationError
@@ -80,6 +81,16 @@ def test_a_dataset_holds_what_its_folder_holds_with_blocks_in_one_order(folder, 
         np.testing.assert_allclose(a.actions["rel"], b.actions["rel"], atol=1e-5)
         assert not a.pictures
         assert not b.pictures
+
+
+def test_tasks_that_nobody_names_any_more_are_not_judged(dataset, tmp_path, monkeypatch):
+    """As after a merge, which loses the manifest that names tasks beyond CALVIN's."""
+    copy = shutil.copytree(dataset, tmp_path / "merged")
+    (copy / MANIFEST).unlink()
+    source = DatasetSource("me/desk", copy)
+    assert source.read(0, False).task == TASKS[0]
+    monkeypatch.setattr(source, "_task_names", source._task_names[:1])
+    assert source.read(0, False).task == ""
 
 
 def test_blocks_in_the_order_of_calvins_files_fulfil_another_task(folder):

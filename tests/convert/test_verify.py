@@ -48,6 +48,11 @@ def test_a_fresh_dataset_equals_its_source(tmp_path, options, episodes, frames, 
     assert told.count("pixel by pixel") == exact
 
 
+def test_without_a_process_nothing_is_read(tmp_path):
+    with pytest.raises(ValueError, match=r"--workers=0: expected 1 or more"):
+        verify.verify(VerifyConfig("me/desk", tmp_path, tmp_path, workers=0))
+
+
 def test_a_source_in_single_precision_is_equal_too(calvin, tmp_path):
     angles = np.random.default_rng(0).uniform(-3, 3, (len(calvin.frames), 3))
     for turned, (frame, content) in zip(angles, calvin.frames.items(), strict=True):
